@@ -1,0 +1,33 @@
+"""`bipedtrack`: the list of commands; `bipedtrack --version`: the versions of package and stack."""
+
+import argparse
+
+from bipedtrack import __version__, versions
+
+COMMANDS = {
+    "train": "train a policy through the stages of a curriculum",
+    "export": "write the policy of a training run to one file that numpy alone can run",
+    "doctor": "check versions, devices, rendering and the physics of this machine",
+}
+
+
+def main() -> None:
+    """Prints the commands or the versions; leaves with status 2 on any other argument."""
+    parser = argparse.ArgumentParser(
+        prog="bipedtrack",
+        description="commands, each with a --help of its own:\n"
+        + "\n".join(f"  python -m bipedtrack.{name:<9}{purpose}" for name, purpose in COMMANDS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--version",
+        action="version",
+        version=f"bipedtrack {__version__}\n{versions.table(versions.check())}",
+        help="print the versions of bipedtrack and of its stack",
+    )
+    parser.parse_args()
+    parser.print_help()
+
+
+if __name__ == "__main__":
+    main()
