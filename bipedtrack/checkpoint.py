@@ -1,0 +1,393 @@
+"""Verified array files, and the run directory that keeps a training's checkpoints.
+
+An array file (a checkpoint, a policy) is an uncompressed `.npz` that numpy can read, with two additions. Its
+entry `__manifest__` is JSON: format, version, kind, a `meta` dict, and each array's name, shape, dtype and
+sha256. Its last 64 bytes, the comment of the zip, are the sha256 of everything before them. So a file is read
+only if it is byte for byte what was written. Nothing in it is executed, and nothing expands beyond its size.
+
+A run directory:
+
+    run.json            the settings of the run, written last when it is created: what has it holds a run
+    lock                locked by the process that trains; the system frees it however that process ends
+    checkpoints/*.npz   the newest three, named by index
+
+Only numpy and the standard library: policies load through this module on machines without JAX.
+"""
+
+import contextlib
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = "bipedtrack"
+FORMAT_VERSION = 1
+KEPT_CHECKPOINTS = 3
+
+_MANIFEST = "__manifest__"
+_SEAL_BYTES = 64  # a sha256 in hexadecimal
+_UNFINISHED = ".unfinished"  # suffix of files being written
+_DTYPE_KINDS = "biufc"  # booleans and numbers: never objects, which would be pickle
+
+
+class CheckpointError(ValueError):
+    """An array file that is damaged, foreign or of another kind; the message is one line."""
+
+
+class RunError(RuntimeError):
+    """A run directory that cannot be used, or a file that cannot be written; the message is one line."""
+
+
+# Array files
+
+
+def save_arrays(path: str | Path, arrays: Mapping[str, Any], meta: dict[str, Any], kind: str) -> None:
+    """Writes `arrays` and the JSON-able `meta` to `path`, atomically; equal content gives equal bytes.
+
+    `kind` says what the file is ("policy"); `load_arrays` asks for it. Names are of ASCII letters, digits and
+    `_ - . /`; dtypes are booleans and numbers. Raises ValueError for others, and RunError if the file cannot
+    be written (a full disk): what stood at `path` is then untouched.
+    """
+    contents: dict[str, np.ndarray] = {}
+    for name, value in arrays.items():
+        array = contents[name] = np.asarray(value, order="C")
+        if not re.fullmatch(r"[\w.\-/]+", name, re.ASCII) or name == _MANIFEST:
+            raise ValueError(f"{name!r} cannot name an array; wanted ASCII letters, digits and _ - . /")
+        if array.dtype.kind not in _DTYPE_KINDS:
+            raise ValueError(f"array {name} has dtype {array.dtype}; wanted booleans or numbers")
+    manifest = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "kind": kind,
+        "arrays": [{"name": name, **_fingerprint(array)} for name, array in contents.items()],
+        "meta": meta,
+    }
+    encoded = np.frombuffer(json.dumps(manifest, default=_plain).encode(), np.uint8)
+    _write_atomically(Path(path), _pack({_MANIFEST: encoded, **contents}))
+
+
+def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the meta dict of a file of this `kind`, every byte verified.
+
+    Raises CheckpointError for a file that is missing, cut off, changed, foreign, of another kind or version.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror or error}); wanted a {kind} file"
+        raise CheckpointError(f"{path}: {reason}") from error
+    try:
+        return _unpack(content, kind)
+    except Exception as error:  # on foreign bytes the parsers of zip, npy and JSON raise nearly anything
+        reason = f"is no {kind} file written by {FORMAT} ({type(error).__name__}: {error})"
+        reason = str(error) if isinstance(error, CheckpointError) else reason
+        raise CheckpointError(" ".join(f"{path}: {reason}".split())) from None
+
+
+def _fingerprint(array: np.ndarray) -> dict[str, Any]:
+    digest = hashlib.sha256(array.tobytes()).hexdigest()
+    return {"shape": list(array.shape), "dtype": array.dtype.str, "sha256": digest}
+
+
+def _pack(contents: dict[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in contents.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, array, version=(1, 0), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue())
+    # A zip ends in the length of its comment (0) and the comment (none): make that the seal's.
+    body = buffer.getvalue()[:-2] + _SEAL_BYTES.to_bytes(2, "little")
+    return body + _seal(body)
+
+
+def _seal(body: bytes) -> bytes:
+    return hashlib.sha256(body).hexdigest().encode()
+
+
+def _unpack(content: bytes, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    if _seal(content[:-_SEAL_BYTES]) != content[-_SEAL_BYTES:]:
+        raise CheckpointError(
+            f"is cut off, changed or not written by {FORMAT} (wrong checksum); wanted an intact {kind} file"
+        )
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        # Entries that are stored as they are and fit into the file together cannot expand in memory.
+        size = sum(member.file_size for member in members)
+        if size > len(content) or any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise CheckpointError(f"has {len(content)} bytes but expands to {size}; wanted no compression")
+        manifest = json.loads(_read_member(archive, _MANIFEST).tobytes())
+        _check_manifest(manifest, kind)
+        wanted = [f"{name}.npy" for name in (_MANIFEST, *(entry["name"] for entry in manifest["arrays"]))]
+        found = [member.filename for member in members]
+        if found != wanted or len(set(found)) != len(found):
+            raise CheckpointError(f"has the entries {found}; its manifest wants {wanted}")
+        arrays = {}
+        for entry in manifest["arrays"]:
+            name = entry.pop("name")
+            arrays[name] = _read_member(archive, name)
+            for key, value in _fingerprint(arrays[name]).items():
+                if entry[key] != value:
+                    raise CheckpointError(f"array {name} has {key} {value}; its manifest wants {entry[key]}")
+        return arrays, manifest["meta"]
+
+
+def _check_manifest(manifest: dict[str, Any], kind: str) -> None:
+    if manifest["format"] != FORMAT or not isinstance(manifest["meta"], dict):
+        raise CheckpointError(f"is not a {FORMAT} file; wanted a {kind} file")
+    if manifest["version"] != FORMAT_VERSION:
+        raise CheckpointError(
+            f"has format version {manifest['version']}, this {FORMAT} reads {FORMAT_VERSION}; "
+            f"wanted the {FORMAT} that wrote it"
+        )
+    if manifest["kind"] != kind:
+        raise CheckpointError(f"is a {manifest['kind']} file; wanted a {kind} file")
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """One array, its header checked against the bytes that are there before anything of its size is made."""
+    with archive.open(f"{name}.npy") as member:
+        if np.lib.format.read_magic(member) != (1, 0):
+            raise CheckpointError(f"array {name} has another npy format; wanted 1.0")
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(member)
+        data = member.read()
+    if dtype.kind not in _DTYPE_KINDS or fortran_order:
+        raise CheckpointError(f"array {name} has dtype {dtype}; wanted booleans or numbers in C order")
+    size = math.prod(shape) * dtype.itemsize
+    if len(data) != size:
+        raise CheckpointError(f"array {name} has {len(data)} bytes; its header wants {size}")
+    return np.frombuffer(data, dtype).reshape(shape).copy()
+
+
+def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Nested dicts of arrays as one dict, the keys joined with `/`: {"a": {"b": x}} gives {"a/b": x}.
+
+    Raises ValueError for what `unflatten` could not give back: an empty dict inside, a key that is no string,
+    is empty or has a `/` in it, a leaf that is no array of numbers.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for key, value in tree.items():
+        if not isinstance(key, str) or not key or "/" in key:
+            raise ValueError(f"{key!r} cannot be a key: wanted a string without /")
+        if isinstance(value, Mapping):
+            if not value:
+                raise ValueError(f"{key!r} is an empty dict, which has no array to be saved in")
+            arrays |= {f"{key}/{name}": array for name, array in flatten(value).items()}
+        elif isinstance(value, list | tuple) or np.asarray(value).dtype.kind not in _DTYPE_KINDS:
+            raise ValueError(f"{key!r} is a {type(value).__name__}; wanted an array of numbers or a dict")
+        else:
+            arrays[key] = np.asarray(value)
+    return arrays
+
+
+def unflatten(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The nested dicts that `flatten` took apart. Raises ValueError if a name is an array and a dict."""
+    tree: dict[str, Any] = {}
+    for name, array in arrays.items():
+        *parents, last = name.split("/")
+        branch = tree
+        for parent in parents:
+            branch = branch.setdefault(parent, {})
+            if not isinstance(branch, dict):
+                raise ValueError(f"{name!r} lies inside of an array")
+        if last in branch:
+            raise ValueError(f"{name!r} is both an array and a dict")
+        branch[last] = array
+    return tree
+
+
+# Text files
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Writes `content` as JSON, atomically. Numbers that are not finite become null. Raises RunError."""
+    _write_atomically(Path(path), (_strict_json(content, indent=2) + "\n").encode())
+
+
+def append_jsonl(path: str | Path, record: Any) -> None:
+    """Appends `record` as one line of JSON in one write; a last line that was cut off is dropped first.
+
+    Numbers that are not finite become null. Raises RunError if it cannot be written; then no part of it is.
+    """
+    line = (_strict_json(record) + "\n").encode()
+    with _os_errors(path, "written"), open(path, "a+b", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END)
+        if end and os.pread(file.fileno(), 1, end - 1) != b"\n":
+            end = os.pread(file.fileno(), end, 0).rfind(b"\n") + 1
+            file.truncate(end)
+        if file.write(line) != len(line):  # the disk became full in the middle
+            file.truncate(end)
+            raise OSError("no space for the whole line")
+
+
+def _strict_json(content: Any, indent: int | None = None) -> str:
+    # Python writes NaN and Infinity, which JSON does not have; they can be replaced on reading them back.
+    finite = json.loads(json.dumps(content, default=_plain), parse_constant=lambda _: None)
+    return json.dumps(finite, indent=indent)
+
+
+def _plain(value: Any) -> Any:
+    """An array or a scalar of numpy or JAX as lists and numbers."""
+    if not hasattr(value, "tolist"):
+        raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
+    return value.tolist()
+
+
+def _write_atomically(path: Path, content: bytes) -> None:
+    """Puts `content` at `path`, whole or not at all, even if the power fails. Raises RunError."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}{_UNFINISHED}")
+    with _os_errors(path, "written"):
+        try:
+            with open(unfinished, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        except BaseException:
+            unfinished.unlink(missing_ok=True)
+            raise
+        directory = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(directory)  # the new name, too, must be on the disk
+        finally:
+            os.close(directory)
+
+
+@contextlib.contextmanager
+def _os_errors(path: str | Path, action: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"{path}: cannot be {action}: {error.strerror or error}") from error
+
+
+# The run directory
+
+
+class RunDirectory:
+    """The directory of one training run.
+
+    `RunDirectory.create` and `RunDirectory.open` lock it, to train in it. `RunDirectory(path)` only reads,
+    also while another process trains.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.warnings: list[str] = []  # what `latest` skipped, a line each
+        self._lock: int | None = None
+        self._settings_file = self.path / "run.json"
+        self._checkpoints = self.path / "checkpoints"
+
+    @classmethod
+    def create(cls, path: str | Path, settings: dict[str, Any]) -> "RunDirectory":
+        """A new run with these JSON-able `settings`. Raises RunError if there is a run at `path` already."""
+        run = cls(path)
+        with _os_errors(path, "created"):
+            run._checkpoints.mkdir(parents=True, exist_ok=True)
+        run._acquire()
+        try:
+            if run._settings_file.exists():
+                raise RunError(f"{path}: already holds a run; go on with --resume or use another directory")
+            if run._indices():
+                raise RunError(f"{path}: holds checkpoints without their run.json; use another directory")
+            write_json(run._settings_file, settings)
+        except BaseException:
+            run.close()
+            raise
+        return run
+
+    @classmethod
+    def open(cls, path: str | Path) -> "RunDirectory":
+        """The run at `path`, to continue it. Raises RunError if there is none or a process trains in it."""
+        run = cls(path)
+        with _os_errors(path, "opened"):
+            if not run._settings_file.exists():
+                raise RunError(f"{path}: holds no run to resume (no run.json); start one without --resume")
+            run._checkpoints.mkdir(exist_ok=True)
+        run._acquire()
+        return run
+
+    @property
+    def settings(self) -> Any:
+        """What `create` wrote to `run.json`. Raises RunError when it cannot be read."""
+        with _os_errors(self._settings_file, "read"):
+            try:
+                return json.loads(self._settings_file.read_bytes())
+            except (ValueError, RecursionError) as error:
+                raise RunError(f"{self._settings_file}: is damaged ({error}); wanted JSON") from error
+
+    def save_checkpoint(self, index: int, arrays: Mapping[str, Any], meta: dict[str, Any]) -> Path:
+        """Writes `checkpoints/<index>.npz`, and once it is safely there removes all but the newest three.
+
+        Raises RunError when it cannot be written (a full disk); the checkpoints before it are then untouched.
+        """
+        if self._lock is None:
+            raise RunError(f"{self.path}: is not locked; wanted RunDirectory.create or RunDirectory.open")
+        path = self._checkpoint(index)
+        save_arrays(path, arrays, {"index": index, "meta": meta}, "checkpoint")
+        # Later ones, if any, were skipped as damaged when the run resumed: they count for nothing.
+        for old in [i for i in self._indices() if i <= index][:-KEPT_CHECKPOINTS]:
+            with _os_errors(self._checkpoint(old), "removed"):
+                self._checkpoint(old).unlink(missing_ok=True)
+        return path
+
+    def latest(self) -> tuple[int, dict[str, np.ndarray], dict[str, Any]] | None:
+        """(index, arrays, meta) of the newest intact checkpoint, None before the first; see also `warnings`.
+
+        Raises CheckpointError when there are checkpoints but none is intact.
+        """
+        self.warnings = []
+        for index in reversed(self._indices()):
+            path = self._checkpoint(index)
+            try:
+                arrays, meta = load_arrays(path, "checkpoint")
+                if meta.get("index") != index:
+                    raise CheckpointError(f"{path}: is number {meta.get('index')}, renamed; wanted {index}")
+                return index, arrays, meta["meta"]
+            except CheckpointError as error:
+                self.warnings.append(f"skipped {error}")
+        if self.warnings:
+            raise CheckpointError(f"{self.path}: no checkpoint is intact; {self.warnings[0]}")
+        return None
+
+    def close(self) -> None:
+        """Frees the lock, which otherwise lasts as long as the process."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _checkpoint(self, index: int) -> Path:
+        return self._checkpoints / f"{index:04d}.npz"
+
+    def _indices(self) -> list[int]:
+        """The indices of the checkpoints that are there, damaged or not, in ascending order."""
+        names = [re.fullmatch(r"(\d{4,})\.npz", file.name) for file in self._checkpoints.glob("*.npz")]
+        return sorted(int(name[1]) for name in names if name)
+
+    def _acquire(self) -> None:
+        """Locks the directory for this process and removes what interrupted writes left behind."""
+        import fcntl  # not on Windows, where policies must still load
+
+        with _os_errors(self.path / "lock", "locked"):
+            self._lock = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.ftruncate(self._lock, 0)
+                os.pwrite(self._lock, str(os.getpid()).encode(), 0)
+                for folder in (self.path, self._checkpoints):
+                    for unfinished in folder.glob(f"*{_UNFINISHED}"):
+                        unfinished.unlink(missing_ok=True)
+            except OSError as error:
+                holder = os.pread(self._lock, 20, 0).decode(errors="replace") or "unknown"
+                self.close()
+                if not isinstance(error, BlockingIOError):
+                    raise
+                raise RunError(f"{self.path}: is in use by process {holder}; wait for it or use another directory") from None
