@@ -1,0 +1,86 @@
+"""From a command and a feedback to joint targets: feedforward, mixing, clamp and filter (eqs 4-7)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+from bipedtrack import kinematics
+from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
+from bipedtrack.robot import Robot
+from bipedtrack.rotations import Array, namespace
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlConfig:
+    """Parameters of the control law."""
+
+    filter: float = 0.4  # α_filter of eq (7), per control step of 0.005 s
+    feedback_scale: float = 0.2  # feedback = clip(scale x network output, -1, 1)
+    level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
+    velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
+
+    def __post_init__(self) -> None:
+        if not 0 < self.filter <= 1:
+            raise ValueError(f"filter must lie in (0, 1], not {self.filter}")
+        if not self.feedback_scale > 0:
+            raise ValueError(f"feedback_scale must be positive, not {self.feedback_scale}")
+
+
+class ControlState(NamedTuple):
+    """What the control law remembers from one control step to the next."""
+
+    filtered: Array  # (12,) u_{t-1} of eq (7), in [-1, 1]
+    feedforward: Array  # (12,) a_ff of the last control step
+
+
+def feedforward(robot: Robot, settings: ControlConfig, target: Nodes) -> Array:
+    """a_ff (12,): the joint angles of the real-time target by inverse kinematics, normalised (eqs 4, 5).
+
+    F_B is the *target* trunk frame: with the measured one the stance leg's target would be where the leg already is, and
+    the PD would have nothing to push against. A target out of the workspace is projected first.
+    """
+    joints = kinematics.inverse(robot, *kinematics.project(robot, *ankles_in_trunk_frame(target)))
+    if settings.level_feet:
+        joints = kinematics.level_feet(robot, joints, target.trunk_orientation)
+    return normalize(robot, joints)
+
+
+def normalize(robot: Robot, joints: Array) -> Array:
+    """Joint angles (12,), rad, as shares of the joints' half ranges from their middles: [-1, 1] (eq 5)."""
+    xp = namespace(joints)
+    middle, half = (xp.asarray(v, dtype=joints.dtype) for v in (robot.joint_middle, robot.joint_half_range))
+    return (joints - middle) / half
+
+
+def denormalize(robot: Robot, action: Array) -> Array:
+    """Joint angles (12,), rad, of control signals in [-1, 1]."""
+    xp = namespace(action)
+    middle, half = (xp.asarray(v, dtype=action.dtype) for v in (robot.joint_middle, robot.joint_half_range))
+    return middle + half * action
+
+
+def initial(joints_normalized: Array) -> ControlState:
+    """The state of a controller that has long been asking for these joint angles, (12,) normalised."""
+    xp = namespace(joints_normalized)
+    return ControlState(xp.clip(joints_normalized, -1.0, 1.0), joints_normalized)
+
+
+def joint_targets(
+    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array
+) -> tuple[Array, ControlState]:
+    """Joint targets (12,), rad, for the PD and the next state, from feedforward and feedback (12,) in [-1, 1].
+
+    Eq (6) mixes a_ff + k_b a_fb; eq (7) is read as a recursive first-order low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}),
+    for only the recursion bounds the rate of the targets.
+    """
+    xp = namespace(a_ff)
+    mixed = a_ff + xp.asarray(robot.feedback_ratio, dtype=a_ff.dtype) * a_fb
+    filtered = xp.clip(settings.filter * mixed + (1 - settings.filter) * state.filtered, -1.0, 1.0)
+    targets = denormalize(robot, filtered)
+    if settings.velocity_feedforward:
+        half, lag = (
+            xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_half_range, robot.kd / (robot.kp * robot.timestep))
+        )
+        targets = targets + lag * half * (a_ff - state.feedforward)
+    return targets, ControlState(filtered, a_ff)

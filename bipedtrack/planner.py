@@ -1,0 +1,112 @@
+"""The trajectory planner: a task step and a time give the command of eq (3).
+
+Ankles follow Bezier curves of any order (the paper's are of fourth order) or trigonometric ones; the trunk moves at
+uniform velocity and angular velocity; rates are analytic. Section III-C of the paper. A task step is data: whatever
+writes its control points plans the motion.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from bipedtrack import rotations
+from bipedtrack.nodes import NodeRates, Nodes
+from bipedtrack.rotations import Array, namespace
+
+
+class TaskStep(NamedTuple):
+    """One foot's movement from leaving the ground to returning to it, or a movement of the trunk alone."""
+
+    start: Nodes  # at time 0
+    end: Nodes  # I^s, at time `period`
+    period: Array  # () s
+    swing: Array  # (2,) 1 where the foot is in the air, else 0
+    ankle_points: Array  # (2, n + 1, 3) Bezier control points in the world, m; constant for a stance foot
+    lift: Array  # (2,) m, height of a trigonometric curve above its chord
+    trigonometric: Array  # () 1: ankles follow trigonometric curves, 0: Bezier curves
+
+
+class Command(NamedTuple):
+    """The control input I of eq (3) at one instant, and the derivative I_v^t of eq (8), in the world frame."""
+
+    end: Nodes  # I^s
+    target: Nodes  # I^t
+    rates: NodeRates  # dI^t/dt
+    timer: Array  # (2,) T: s until the swing foot touches the ground, 0 for a stance foot
+
+
+def bezier(points: Array, s: Array) -> tuple[Array, Array]:
+    """The point and the derivative by s, each (..., 3), of Bezier curves (..., n + 1, 3) at s in [0, 1] (de Casteljau)."""
+    order = points.shape[-2] - 1
+    for _ in range(order - 1):
+        points = points[..., :-1, :] + s * (points[..., 1:, :] - points[..., :-1, :])
+    chord = points[..., 1, :] - points[..., 0, :]
+    return points[..., 0, :] + s * chord, order * chord
+
+
+def trigonometric(start: Array, end: Array, lift: Array, s: Array) -> tuple[Array, Array]:
+    """The point and the derivative by s, each (2, 3), of cycloid-like curves from start to end, (2, 3), lifted by (2,) m.
+
+    Speed is zero at both ends.
+    """
+    xp = namespace(start)
+    angle = 2 * math.pi * s
+    along, along_rate = s - xp.sin(angle) / (2 * math.pi), 1 - xp.cos(angle)
+    up = xp.stack([xp.zeros_like(lift), xp.zeros_like(lift), lift], axis=-1)
+    point = start + along * (end - start) + (0.5 - 0.5 * xp.cos(angle)) * up
+    return point, along_rate * (end - start) + (math.pi * xp.sin(angle)) * up
+
+
+def command(step: TaskStep, time: Array) -> Command:
+    """The command at `time` seconds, (), into the step; from the period on its end stands still (rates and T are zero)."""
+    xp = namespace(step.period)
+    running = xp.where(time < step.period, xp.ones_like(step.period), xp.zeros_like(step.period))
+    s = xp.clip(time / step.period, 0.0, 1.0)
+    per_second = running / step.period
+    start, end = step.start, step.end
+
+    on_bezier, bezier_rate = bezier(step.ankle_points, s)
+    on_sine, sine_rate = trigonometric(start.ankle_positions, end.ankle_positions, step.lift, s)
+    ankles = xp.where(step.trigonometric > 0, on_sine, on_bezier)
+    ankle_rates = xp.where(step.trigonometric > 0, sine_rate, bezier_rate)
+
+    turn = rotations.multiply(rotations.conjugate(start.trunk_orientation), end.trunk_orientation)
+    turn = rotations.to_rotation_vector(turn)  # constant axis: the same in both trunk frames
+    orientation = rotations.multiply(start.trunk_orientation, rotations.from_rotation_vector(s * turn))
+    travel = end.trunk_position - start.trunk_position
+    yaw_travel = rotations.wrap(end.ankle_yaws - start.ankle_yaws)
+
+    target = Nodes(
+        trunk_position=start.trunk_position + s * travel,
+        trunk_orientation=orientation,
+        ankle_positions=ankles,
+        ankle_yaws=start.ankle_yaws + (s * s * (3 - 2 * s)) * yaw_travel,
+    )
+    rates = NodeRates(
+        trunk_velocity=per_second * travel,
+        trunk_angular_velocity=rotations.to_matrix(start.trunk_orientation) @ (per_second * turn),
+        ankle_velocities=per_second * ankle_rates,
+        ankle_yaw_rates=(per_second * 6 * s * (1 - s)) * yaw_travel,
+    )
+    return Command(end, target, rates, running * (step.period - time) * step.swing)
+
+
+def swing_points(start: Array, end: Array, lift: Array, along: Array, height: Array) -> Array:
+    """Control points (2, n + 1, 3), m, of curves from start to end, (2, 3), that rise `lift`, (2,) m, above the higher end.
+
+    along: (n - 1,) shares of the way to the end of the inner control points; height: (n - 1,) their heights as multiples
+    of what lifts a symmetric curve of this order by exactly `lift`.
+    """
+    xp = namespace(start)
+    order = along.shape[0] + 1
+    top = xp.maximum(start[:, 2], end[:, 2])
+    # the inner points' share of a Bezier curve at s = 1/2 is 1 - 2^(1 - order)
+    rise = lift / (1 - 2.0 ** (1 - order))
+    way = end - start
+    inner_xy = start[:, None, :2] + along[None, :, None] * way[:, None, :2]
+    inner_z = top[:, None] + rise[:, None] * height[None, :]
+    # a foot that is not lifted keeps its height
+    inner_z = xp.where((lift > 0)[:, None], inner_z, (start[:, 2:] + along[None, :] * way[:, 2:]))
+    inner = xp.concat([inner_xy, inner_z[..., None]], axis=-1)
+    return xp.concat([start[:, None], inner, end[:, None]], axis=1)

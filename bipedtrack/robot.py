@@ -1,0 +1,161 @@
+"""What never changes about a robot: link lengths, joint order, limits, gains, and its MuJoCo model.
+
+A robot is a folder `models/<name>/` with `<name>.xml` (MJCF; its position actuators are the PD controllers) and
+`<name>.toml` (what an MJCF does not say). Nothing is written twice: lengths, ranges and gains come from the compiled
+model, so this module needs MuJoCo, but only inside the functions that load.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bipedtrack import config, paths
+
+LEGS = ("left", "right")
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot:
+    """Constants of one robot; joints are in the order of the actuators, left leg first, from hip to foot."""
+
+    name: str
+    joint_names: tuple[str, ...]
+    hips: np.ndarray  # (2, 3) left and right hip in the trunk frame F_B, m
+    thigh: float  # hip to knee, m
+    shank: float  # knee to ankle, m
+    ankle_height: float  # ankle above the sole, m
+    sole: np.ndarray  # (2,) length and width of the sole, m
+    leg_length: np.ndarray  # (2,) least and greatest distance from hip to ankle that commands may use, m
+    joint_low: np.ndarray  # (12,) rad
+    joint_high: np.ndarray  # (12,) rad
+    feedback_ratio: np.ndarray  # (12,) k_b of eq (6), in half joint ranges
+    kp: np.ndarray  # (12,) N m / rad
+    kd: np.ndarray  # (12,) N m s / rad
+    torque_limit: np.ndarray  # (12,) N m
+    timestep: float  # control period, s
+
+    @property
+    def joint_middle(self) -> np.ndarray:
+        """(12,) rad: the joint angle that eq (5) maps to 0."""
+        return (self.joint_low + self.joint_high) / 2
+
+    @property
+    def joint_half_range(self) -> np.ndarray:
+        """(12,) rad: what eq (5) maps to 1 above the middle."""
+        return (self.joint_high - self.joint_low) / 2
+
+    def cast(self, dtype: Any) -> Robot:
+        """The same robot with its arrays in another floating-point type."""
+        arrays: dict[str, Any] = {k: v.astype(dtype) for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return dataclasses.replace(self, **arrays)
+
+
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """The robot's TOML file: names that the MJCF uses and what it does not say."""
+
+    trunk: str
+    legs: tuple[str, str]
+    joints: tuple[str, str, str, str, str, str]
+    feedback_ratio: float
+    leg_length: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not 0 < self.leg_length[0] < self.leg_length[1]:
+            raise ValueError(f"leg_length must be two growing positive lengths, not {list(self.leg_length)}")
+        if not 0 <= self.feedback_ratio <= 2:
+            raise ValueError(f"feedback_ratio must lie in [0, 2], not {self.feedback_ratio}")
+
+
+class RobotError(ValueError):
+    """A robot that cannot be had, in one line that says which are there or what its model lacks."""
+
+
+def mjcf_path(name: str) -> pathlib.Path:
+    """The path of a robot's MJCF. Raises RobotError when there is no such robot."""
+    folder = paths.data_dir("models")
+    path = folder / name / f"{name}.xml"
+    if not path.is_file():
+        known = sorted(p.parent.name for p in folder.glob("*/*.xml") if p.stem == p.parent.name)
+        raise RobotError(f"no robot named {name!r} in models/; there are: {', '.join(known)}")
+    return path
+
+
+def load(name: str = "ranger_max") -> Robot:
+    """The constants of a robot, in float64. Raises RobotError or config.ConfigError in one line."""
+    import mujoco
+
+    path = mjcf_path(name)
+    description = config.load(Description, path.with_suffix(".toml"))
+    return from_model(name, mujoco.MjModel.from_xml_path(str(path)), description)
+
+
+def from_model(name: str, model: Any, description: Description) -> Robot:
+    """The constants read from a compiled MuJoCo model. Raises RobotError where names or the order do not fit."""
+    joint_names = tuple(f"{leg}_{joint}" for leg in description.legs for joint in description.joints)
+    actuated = tuple(model.joint(int(i)).name for i in model.actuator_trnid[:, 0])
+    ordered = tuple(model.joint(i).name for i in range(1, model.njnt))
+    if actuated != joint_names or ordered != joint_names:
+        raise RobotError(f"{name}: joints and actuators must be {', '.join(joint_names)}, in this order")
+    joints = [model.joint(n) for n in joint_names]
+    low, high = np.array([j.range for j in joints]).T
+
+    def chain(leg: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Offsets trunk to hip, hip to knee, knee to ankle, from the bodies that carry those joints."""
+        carried = {name: model.body(int(model.joint(f"{leg}_{name}").bodyid[0])) for name in description.joints}
+        return carried["hip_yaw"].pos, carried["knee"].pos, carried["ankle_pitch"].pos
+
+    left, right = (chain(leg) for leg in description.legs)
+    soles = [g for g in map(model.geom, range(model.ngeom)) if g.name.startswith(f"{description.legs[0]}_sole")]
+    if not soles:
+        raise RobotError(f"{name}: no geom is named {description.legs[0]}_sole_*, which touch the ground")
+    corners = np.array([g.pos for g in soles])
+    return Robot(
+        name=name,
+        joint_names=joint_names,
+        hips=np.array([left[0], right[0]]),
+        thigh=float(-left[1][2]),
+        shank=float(-left[2][2]),
+        ankle_height=float(soles[0].size[0] - corners[0, 2]),
+        sole=2 * np.abs(corners[:, :2]).max(axis=0),
+        leg_length=np.array(description.leg_length),
+        joint_low=low,
+        joint_high=high,
+        feedback_ratio=np.full(len(joint_names), description.feedback_ratio),
+        kp=model.actuator_gainprm[:, 0].copy(),
+        kd=-model.actuator_biasprm[:, 2],
+        torque_limit=model.actuator_forcerange[:, 1].copy(),
+        timestep=float(model.opt.timestep),
+    )
+
+
+def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: bool = False) -> Any:
+    """The compiled MuJoCo model of a robot with movable boxes for stairs and obstacles.
+
+    Args:
+      name: the robot.
+      boxes: (length, width, height) of each box, m; box i is the mocap body i, parked far below the ground.
+      converged: solve every contact problem to convergence instead of the few iterations of the MJCF.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec.from_file(str(mjcf_path(name)))
+    for i, size in enumerate(boxes):
+        body = spec.worldbody.add_body(name=f"box_{i}", mocap=True, pos=[0, 0, -10.0 - i])
+        body.add_geom(
+            name=f"box_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[0.5 * s for s in size],
+            conaffinity=1,
+            contype=0,
+            friction=[1, 0.005, 0.0001],
+            rgba=[0.62, 0.60, 0.56, 1],
+        )
+    if converged:
+        spec.option.iterations, spec.option.ls_iterations = 100, 50
+    return spec.compile()

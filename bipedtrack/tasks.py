@@ -1,0 +1,309 @@
+"""The task steps of Table II drawn at random: what an episode asks for, and each of its task steps in turn.
+
+All that lessons change (ranges, shares, hold) is data in a `Distribution`, so one compiled program serves every lesson.
+Random numbers are jax's; the namespace is jax.numpy.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bipedtrack import nodes, planner, rotations, terrain
+from bipedtrack.nodes import Nodes
+from bipedtrack.planner import TaskStep
+from bipedtrack.rotations import Array
+
+KINDS = ("stand", "squat", "walk", "sidle", "turn", "stairs")
+STAND, SQUAT, WALK, SIDLE, TURN, STAIRS = range(len(KINDS))
+FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
+_TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
+
+
+class Ranges(NamedTuple):
+    """Table II as ranges: (lowest, mildest, highest) at full difficulty; at difficulty 0 all is mildest."""
+
+    period: tuple[float, float, float] = (0.4, 0.55, 0.7)  # s, of a task step with a swing foot
+    walk_step: tuple[float, float, float] = (
+        -0.15,
+        0.0,
+        0.25,
+    )  # m the trunk advances per task step; a foot travels twice that
+    sidle_step: tuple[float, float, float] = (-0.12, 0.0, 0.12)  # m to the left per task step
+    turn_yaw: tuple[float, float, float] = (-0.35, 0.0, 0.35)  # rad per task step
+    turn_radius: tuple[float, float, float] = (0.0, 0.2, 0.6)  # m
+    stair_riser: tuple[float, float, float] = (0.02, 0.02, 0.17)  # m
+    stair_tread: tuple[float, float, float] = (0.25, 0.30, 0.35)  # m
+    lift: tuple[float, float, float] = (0.04, 0.08, 0.15)  # m above the higher end of the swing
+    trunk_height: tuple[float, float, float] = (0.70, 0.75, 0.79)  # m above the mean of the soles, while stepping
+    stair_trunk_height: tuple[float, float, float] = (0.70, 0.73, 0.75)  # m
+    step_variation: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on period, lift and advance from step to step
+    curve_along: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # shift of the Bezier control points, share of the way
+    curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
+    trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
+    posture_x: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # m, trunk ahead of the feet's middle (stand, squat)
+    posture_y: tuple[float, float, float] = (-0.04, 0.0, 0.04)  # m
+    posture_height: tuple[float, float, float] = (0.60, 0.75, 0.79)  # m
+    posture_roll: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
+    posture_pitch: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
+    posture_yaw: tuple[float, float, float] = (-0.3, 0.0, 0.3)  # rad
+    foot_x: tuple[float, float, float] = (-0.1, 0.0, 0.1)  # m, left foot ahead of the right (stand, squat)
+    foot_distance: tuple[float, float, float] = (0.17, 0.20, 0.30)  # m
+    foot_yaw: tuple[float, float, float] = (-0.2, 0.0, 0.2)  # rad
+    squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s
+
+    def validate(self) -> None:
+        """Raises ValueError where a range does not grow."""
+        for name, (low, mild, high) in self._asdict().items():
+            if not low <= mild <= high:
+                raise ValueError(f"{name} must be [lowest, mildest, highest], not {[low, mild, high]}")
+        if self.period[0] <= 0 or self.squat_period[0] <= 0:
+            raise ValueError("periods must be positive")
+
+
+class Shares(NamedTuple):
+    """How often each kind is drawn, up to a common factor."""
+
+    stand: float
+    squat: float
+    walk: float
+    sidle: float
+    turn: float
+    stairs: float
+
+    def validate(self) -> None:
+        """Raises ValueError where no kind can be drawn."""
+        if min(self) < 0 or sum(self) <= 0:
+            raise ValueError(f"shares must not be negative and not all be zero: {self._asdict()}")
+
+
+class Distribution(NamedTuple):
+    """What episodes are drawn from: arrays, carried along in the state of every environment."""
+
+    shares: Array  # (6,) cumulative, ending at 1
+    hold_share: Array  # () share of the episodes that stop and hold
+    hold_after: Array  # (2,) least and greatest number of task steps before the hold
+    ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
+
+
+class Task(NamedTuple):
+    """What an episode keeps from its first to its last task step."""
+
+    kind: Array  # () index in KINDS
+    advance: Array  # (3,) x m, y m, yaw rad by which the place of the feet moves on, per task step
+    first: Array  # () foot that swings first, 0 left, 1 right
+    period: Array  # () s
+    lift: Array  # () m
+    trunk_height: Array  # () m
+    stairs: terrain.Stairs
+    hold_after: Array  # () number of task steps after which every target stays where it is
+
+
+def distribution(
+    ranges: Ranges, shares: Shares, difficulty: float, hold_share: float, hold_after: tuple[int, int]
+) -> Distribution:
+    """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
+    total = jnp.array(shares, jnp.float32)
+    last = max(i for i, share in enumerate(shares) if share > 0)  # rounding must not leave room behind it
+    scaled = {
+        name: jnp.array([mild + difficulty * (low - mild), mild + difficulty * (high - mild)], jnp.float32)
+        for name, (low, mild, high) in ranges._asdict().items()
+    }
+    return Distribution(
+        shares=jnp.cumsum(total / total.sum()).at[last:].set(1.0),
+        hold_share=jnp.float32(hold_share),
+        hold_after=jnp.array(hold_after, jnp.float32),
+        ranges=scaled,
+    )
+
+
+def _draw(key: Array, names: tuple[str, ...], ranges: dict[str, Array]) -> dict[str, Array]:
+    """One uniform number per name, within its range."""
+    u = jax.random.uniform(key, (len(names),))
+    return {name: _within(u[i], ranges[name]) for i, name in enumerate(names)}
+
+
+def _within(u: Array, bounds: Array) -> Array:
+    """The number at the share u of a range (2,)."""
+    return bounds[0] + u * (bounds[1] - bounds[0])
+
+
+def _posture(draw: dict[str, Array], ankles: Array, yaws: Array, ankle_height: float) -> tuple[Array, Array]:
+    """A trunk position (3,) and orientation (4,) over ankles (2, 3), m, with yaws (2,)."""
+    yaw = yaws.mean()
+    middle = ankles.mean(axis=0)
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    x, y = draw["posture_x"], draw["posture_y"]
+    shift = jnp.stack([c * x - s * y, s * x + c * y, draw["posture_height"] - ankle_height])
+    return middle + shift, rotations.from_euler(draw["posture_roll"], draw["posture_pitch"], yaw + draw["posture_yaw"])
+
+
+_POSTURE = ("posture_x", "posture_y", "posture_height", "posture_roll", "posture_pitch", "posture_yaw")
+
+
+def begin(key: Array, given: Distribution, ankle_height: float) -> tuple[Task, Nodes]:
+    """A new episode's task and the nodes it starts from; ankle_height is the ankle above the sole, m."""
+    key_kind, key_task, key_posture = jax.random.split(key, 3)
+    u: Array = jax.random.uniform(key_kind, (5,))
+    kind = jnp.minimum(jnp.searchsorted(given.shares, u[0], side="right"), len(KINDS) - 1)
+    draw = _draw(
+        key_task,
+        ("period", "walk_step", "sidle_step", "turn_yaw", "turn_radius", "stair_riser", "stair_tread", "lift")
+        + ("trunk_height", "stair_trunk_height", "foot_x", "foot_distance", "foot_yaw"),
+        given.ranges,
+    )
+    still = kind <= SQUAT
+    turn, radius = draw["turn_yaw"], draw["turn_radius"]
+    arc = jnp.stack([radius * jnp.sin(jnp.abs(turn)), jnp.sign(turn) * radius * (1 - jnp.cos(turn)), turn])
+    zero = jnp.float32(0)
+    advances = jnp.stack(
+        [
+            jnp.zeros(3),
+            jnp.zeros(3),
+            jnp.stack([draw["walk_step"], zero, zero]),
+            # the leading foot opens by twice the step, the other one closes up
+            jnp.stack([zero, 2 * draw["sidle_step"], zero]),
+            arc,
+            jnp.stack([draw["stair_tread"], zero, zero]),
+        ]
+    )
+    down = u[1] < 0.5
+    on_stairs = kind == STAIRS
+    rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
+    stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))
+
+    # the leading foot of a sidle is the one on the side it goes to
+    first = jnp.where(kind == SIDLE, (draw["sidle_step"] < 0).astype(jnp.int32), (u[2] < 0.5).astype(jnp.int32))
+    holds = u[3] < given.hold_share
+    hold_after = jnp.floor(_within(u[4], given.hold_after + jnp.array([0.0, 1.0])))
+    height = _choose(on_stairs, draw["stair_trunk_height"], draw["trunk_height"])
+    task = Task(
+        kind=kind,
+        advance=advances[kind],
+        first=first,
+        period=draw["period"],
+        lift=draw["lift"],
+        trunk_height=height,
+        stairs=stairs,
+        hold_after=jnp.where(holds, hold_after, 1e6).astype(jnp.int32),
+    )
+
+    distance = jnp.where(still, draw["foot_distance"], FOOT_DISTANCE)
+    ahead = jnp.where(still, draw["foot_x"], 0.0)
+    side = jnp.array([0.5, -0.5])
+    ankles = jnp.stack([side * ahead, side * distance, jnp.full(2, ankle_height + stairs.height)], axis=-1)
+    yaws = jnp.where(still, draw["foot_yaw"] * 2 * side, jnp.zeros(2))
+    posture_position, posture_orientation = _posture(_draw(key_posture, _POSTURE, given.ranges), ankles, yaws, ankle_height)
+    upright = ankles.mean(axis=0) + jnp.array([0.0, 0.0, 1.0]) * (height - ankle_height)
+    return task, Nodes(
+        trunk_position=jnp.where(still, posture_position, upright),
+        trunk_orientation=jnp.where(still, posture_orientation, jnp.array([1.0, 0, 0, 0])),
+        ankle_positions=ankles,
+        ankle_yaws=yaws,
+    )
+
+
+def _foothold(task: Task, index: Array, advance: Array, start: Nodes) -> tuple[Array, Array]:
+    """The end positions (2, 3) and yaws (2,) of both ankles: the swing foot beside the stance foot, moved on."""
+    swing = (index + task.first) % 2
+    stance = 1 - swing
+    side = jnp.array([0.5, -0.5]) * FOOT_DISTANCE
+    position, yaw = start.ankle_positions[stance], start.ankle_yaws[stance]
+    # when a sidle closes up, the place of the feet stays where the leading foot has put it
+    closes = (task.kind == SIDLE) & (index % 2 == 1)
+    advance = jnp.where(closes, 0.0, advance)
+    new_yaw = yaw + advance[2]
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    c2, s2 = jnp.cos(new_yaw), jnp.sin(new_yaw)
+    # stance foot -> middle of the place -> moved on -> swing foot
+    x = s * side[stance] + c * advance[0] - s * advance[1] - s2 * side[swing]
+    y = -c * side[stance] + s * advance[0] + c * advance[1] + c2 * side[swing]
+    foothold = position + jnp.stack([x, y, task.stairs.rise])
+    mine = jnp.arange(2) == swing
+    return (
+        jnp.where(mine[:, None], foothold, start.ankle_positions),
+        jnp.where(mine, new_yaw, start.ankle_yaws),
+    )
+
+
+def _choose(condition: Array, new: Array, old: Array) -> Array:
+    return jnp.where(condition, new, old)
+
+
+def next_step(
+    key: Array,
+    given: Distribution,
+    task: Task,
+    index: Array,
+    start: Nodes,
+    ankle_height: float,
+    timestep: float,
+) -> TaskStep:
+    """Task step number `index` of an episode, from where the last one ended; its period is a multiple of timestep, s."""
+    key_step, key_curve, key_posture = jax.random.split(key, 3)
+    hold = index >= task.hold_after
+    squats = (task.kind == SQUAT) & ~hold
+    steps = (task.kind >= WALK) & ~hold
+
+    vary = jax.random.uniform(key_step, (3,))
+    vary = _within(vary, given.ranges["step_variation"])
+    bounds = given.ranges["period"]
+    period = jnp.where(steps, jnp.clip(task.period * vary[0], bounds[0], bounds[1]), 1.0)
+    advance = jnp.where(task.kind == STAIRS, task.advance, task.advance * vary[2])
+
+    footholds, headings = _foothold(task, index, advance, start)
+    ankles = _choose(steps, footholds, start.ankle_positions)
+    yaws = _choose(steps, headings, start.ankle_yaws)
+    over_feet = ankles.mean(axis=0) + jnp.array([0.0, 0.0, 1.0]) * (task.trunk_height - ankle_height)
+    draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric"), given.ranges)
+    posture_position, posture_orientation = _posture(draw, ankles, yaws, ankle_height)
+    period = jnp.where(squats, draw["squat_period"], period)
+
+    end = Nodes(
+        trunk_position=_choose(steps, over_feet, _choose(squats, posture_position, start.trunk_position)),
+        trunk_orientation=_choose(
+            steps,
+            rotations.from_yaw(yaws.mean()),
+            _choose(squats, posture_orientation, start.trunk_orientation),
+        ),
+        ankle_positions=ankles,
+        ankle_yaws=yaws,
+    )
+    swing = jnp.where(steps, (jnp.arange(2) == (index + task.first) % 2).astype(jnp.float32), 0.0)
+    lift = swing * task.lift * vary[1]
+    u = jax.random.uniform(key_curve, (2, 3))
+    points = planner.swing_points(
+        start.ankle_positions,
+        ankles,
+        lift,
+        along=jnp.array([0.05, 0.5, 0.95]) + _within(u[0], given.ranges["curve_along"]),
+        height=_within(u[1], given.ranges["curve_height"]),
+    )
+    return TaskStep(
+        start=start,
+        end=end,
+        period=jnp.round(period / timestep) * timestep,
+        swing=swing,
+        ankle_points=points,
+        lift=lift,
+        # a trigonometric curve rises above its chord, which passes through the tread between two others
+        trigonometric=((draw["trigonometric"] > 0) & (task.kind != STAIRS)).astype(jnp.float32),
+    )
+
+
+def stance_level(task: Task, index: Array) -> Array:
+    """The tread under the stance foot during task step `index`, (): the place of the window of boxes."""
+    return jnp.minimum(index, task.hold_after)
+
+
+def tracking_errors(errors: nodes.NodeErrors) -> dict[str, Array]:
+    """Mean ankle and trunk errors as people quote them: cm and deg."""
+    degree = 180 / jnp.pi
+    return {
+        "ankle_error_cm": 100 * jnp.linalg.norm(errors.ankle_positions, axis=-1).mean(),
+        "ankle_yaw_error_deg": degree * jnp.abs(errors.ankle_yaws).mean(),
+        "trunk_error_cm": 100 * jnp.linalg.norm(errors.trunk_position),
+        "trunk_error_deg": degree * jnp.linalg.norm(errors.trunk_orientation),
+    }
