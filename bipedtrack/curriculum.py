@@ -1,0 +1,175 @@
+"""The typed configuration of a training: stages of lessons, and all numbers they share.
+
+A curriculum is a TOML file in `curricula/`; loading is strict (see `config`). Stages and lessons become one brax PPO call
+after another: `calls` spells them out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Literal
+
+from bipedtrack import config, paths
+from bipedtrack.control import ControlConfig
+from bipedtrack.rewards import RewardConfig
+from bipedtrack.tasks import Ranges, Shares
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """The actor and the critic: multi-layer perceptrons on the normalised observation."""
+
+    actor: tuple[int, ...] = (512, 512, 512)  # hidden layers
+    critic: tuple[int, ...] = (128, 128)
+    activation: Literal["swish", "tanh", "relu"] = "swish"
+    initial_noise: float = 0.7  # standard deviation of the Gaussian over the network's output
+    normalizer_floor: float = 0.05  # added to the variance of every observation, which may be constant at first
+
+    def __post_init__(self) -> None:
+        if min((*self.actor, *self.critic), default=0) < 1:
+            raise ValueError("actor and critic need at least one hidden layer, each of at least one unit")
+
+
+@dataclasses.dataclass(frozen=True)
+class PpoConfig:
+    """What every PPO call shares. An update gathers num_envs x unroll_length steps (ML-Agents: buffer_size)."""
+
+    num_envs: int = 640
+    unroll_length: int = 32  # policy steps
+    num_minibatches: int = 10  # per epoch; ML-Agents' batch_size is num_envs x unroll_length / num_minibatches
+    num_epochs: int = 3
+    discount: float = 0.98
+    gae_lambda: float = 0.95
+    max_grad_norm: float = 1.0
+    reward_scaling: float = 0.05
+
+    def __post_init__(self) -> None:
+        if min(self.num_envs, self.unroll_length, self.num_minibatches, self.num_epochs) < 1:
+            raise ValueError("num_envs, unroll_length, num_minibatches and num_epochs must be at least 1")
+        if self.num_envs % self.num_minibatches:
+            raise ValueError(
+                f"num_envs ({self.num_envs}) must be a multiple of num_minibatches ({self.num_minibatches}): "
+                "a minibatch is made of whole unrolls"
+            )
+
+    @property
+    def steps_per_update(self) -> int:
+        """Policy steps that one update of the network learns from."""
+        return self.num_envs * self.unroll_length
+
+
+@dataclasses.dataclass(frozen=True)
+class Lesson:
+    """A part of a stage with one difficulty."""
+
+    name: str
+    steps: int  # policy steps, over all environments
+    difficulty: float  # 0 the mildest, 1 the full ranges
+    parts: int = 1  # PPO calls that share the steps; a killed run repeats at most one
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.parts < 1:
+            raise ValueError("steps and parts must be at least 1")
+        if not 0 <= self.difficulty <= 1:
+            raise ValueError(f"difficulty must lie in [0, 1], not {self.difficulty}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A stage of the curriculum: the kinds it draws from, and PPO parameters that fall linearly along it."""
+
+    name: str
+    shares: Shares
+    learning_rate: tuple[float, float]  # at its start and its end
+    entropy_cost: tuple[float, float]  # beta
+    clipping_epsilon: tuple[float, float]  # epsilon
+    lessons: tuple[Lesson, ...]
+    hold_share: float = 0.0  # share of the episodes that stop after some task steps and hold
+    hold_after: tuple[int, int] = (1, 8)  # least and greatest number of task steps before a hold
+
+    def __post_init__(self) -> None:
+        if not self.lessons:
+            raise ValueError(f"stage {self.name!r} has no lessons")
+        if not 0 <= self.hold_share <= 1:
+            raise ValueError(f"hold_share must lie in [0, 1], not {self.hold_share}")
+        if not 0 <= self.hold_after[0] <= self.hold_after[1]:
+            raise ValueError(f"hold_after must be two growing numbers of task steps, not {list(self.hold_after)}")
+
+    @property
+    def steps(self) -> int:
+        """Policy steps of all lessons."""
+        return sum(lesson.steps for lesson in self.lessons)
+
+
+@dataclasses.dataclass(frozen=True)
+class Curriculum:
+    """A whole training."""
+
+    name: str
+    stages: tuple[Stage, ...]
+    robot: str = "ranger_max"
+    policy_period: float = 0.02  # s, for which a feedback is held
+    episode_seconds: float = 10.0
+    evaluation_episodes: int = 48  # for each line of the table at the end of a training; 0: no table
+    ranges: Ranges = Ranges()
+    rewards: RewardConfig = RewardConfig()
+    control: ControlConfig = ControlConfig()
+    network: NetworkConfig = NetworkConfig()
+    ppo: PpoConfig = PpoConfig()
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("a curriculum needs at least one stage")
+        if self.evaluation_episodes < 0:
+            raise ValueError("evaluation_episodes must not be negative")
+        if not 0 < self.policy_period <= self.episode_seconds:
+            raise ValueError("policy_period must be positive and no longer than episode_seconds")
+
+    @property
+    def episode_length(self) -> int:
+        """Policy steps until the time limit."""
+        return round(self.episode_seconds / self.policy_period)
+
+
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """One PPO call: the smallest unit that a resumed run repeats."""
+
+    index: int  # among all calls
+    stage: Stage
+    lesson: Lesson
+    steps: int  # policy steps
+    learning_rate: float
+    entropy_cost: float
+    clipping_epsilon: float
+
+
+def calls(curriculum: Curriculum) -> tuple[Call, ...]:
+    """The PPO calls of a curriculum in order, each with the values at its middle of its stage's falling line."""
+    found: list[Call] = []
+    for stage in curriculum.stages:
+        done = 0
+        for lesson in stage.lessons:
+            for part in range(lesson.parts):
+                steps = lesson.steps // lesson.parts + (part < lesson.steps % lesson.parts)
+                along = (done + steps / 2) / stage.steps
+                rate, entropy, epsilon = (
+                    start + along * (end - start)
+                    for start, end in (stage.learning_rate, stage.entropy_cost, stage.clipping_epsilon)
+                )
+                found.append(Call(len(found), stage, lesson, steps, rate, entropy, epsilon))
+                done += steps
+    return tuple(found)
+
+
+def load(name_or_path: str) -> Curriculum:
+    """A curriculum from a TOML file, or by its name from `curricula/`. Raises config.ConfigError in one line."""
+    path = pathlib.Path(name_or_path)
+    if not path.suffix and not path.exists():
+        folder = paths.data_dir("curricula")
+        path = folder / f"{name_or_path}.toml"
+        if not path.is_file():
+            known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+            raise config.ConfigError(f"no curriculum named {name_or_path!r} in curricula/; there are: {known}")
+    return config.load(Curriculum, path)

@@ -1,0 +1,237 @@
+"""The environment: a tracking robot as a pure-functional brax Env over MJX.
+
+Written for one robot; training maps it over thousands. `TrackingEnv.step` is the table of contents.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import brax.envs
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from bipedtrack import (
+    control,
+    kinematics,
+    nodes,
+    observation,
+    planner,
+    rewards,
+    robot,
+    rotations,
+    tasks,
+    terrain,
+)
+from bipedtrack.rotations import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """What an environment is built from besides the robot; everything else is data (tasks.Distribution)."""
+
+    rewards: rewards.RewardConfig
+    control: control.ControlConfig
+    policy_period: float = 0.02  # s for which a feedback is held; the rest of the control law runs every 0.005 s
+    stairs: bool = False  # with the boxes of a staircase (slower)
+    fall_tilt_deg: float = 60.0  # the paper's
+    fall_depth: float = 0.35  # m below its target at which the trunk counts as fallen
+    lost_ankle: float = 0.5  # m off its target at which an ankle counts as lost
+
+
+class Physics(NamedTuple):
+    """All that MJX needs to go on: mjx.Data is rebuilt from it inside the step."""
+
+    qpos: Array  # (19,)
+    qvel: Array  # (18,)
+    warmstart: Array  # (18,) qacc from which the solver starts
+    boxes: Array  # (number of boxes, 3) centres, m
+
+
+class Episode(NamedTuple):
+    """What one robot's episode remembers beside its physics."""
+
+    key: Array  # random key of what comes next
+    given: tasks.Distribution
+    task: tasks.Task
+    step: planner.TaskStep
+    index: Array  # () number of the task step
+    tick: Array  # () control steps into it
+    control: control.ControlState
+    feedback: Array  # (12,) a_fb(t-1)
+
+
+class TrackingEnv(brax.envs.Env):
+    """One robot that is told, at every instant, where its nodes should be."""
+
+    def __init__(self, the_robot: robot.Robot, config: EnvConfig, given: tasks.Distribution):
+        """Raises ValueError where the policy period is no multiple of the control period."""
+        self.robot = the_robot
+        self.config = config
+        self.given = given
+        self.substeps = round(config.policy_period / the_robot.timestep)
+        if self.substeps < 1 or not math.isclose(self.substeps * the_robot.timestep, config.policy_period, rel_tol=1e-6):
+            raise ValueError(f"policy_period {config.policy_period} s is no multiple of {the_robot.timestep} s")
+        boxes = [terrain.STAIR_BOX] * terrain.STAIR_BOXES if config.stairs else []
+        self.mj_model = robot.build_model(the_robot.name, boxes)
+        self.mjx_model = mjx.put_model(self.mj_model)
+        self._blank = mjx.make_data(self.mj_model)
+
+    @property
+    def observation_size(self) -> int:
+        """101."""
+        return observation.SIZE
+
+    @property
+    def action_size(self) -> int:
+        """One feedback per joint."""
+        return len(self.robot.joint_names)
+
+    @property
+    def backend(self) -> str:
+        """The physics engine."""
+        return "mjx"
+
+    def reset(self, rng: Array) -> brax.envs.State:
+        """A new episode: task, task step and robot, standing where the first command wants it."""
+        return self.begin(rng, self.given)
+
+    def begin(self, key: Array, given: tasks.Distribution) -> brax.envs.State:
+        """A new episode drawn from `given`. No forward dynamics: joint angles come from inverse kinematics."""
+        key, key_task, key_step = jax.random.split(key, 3)
+        task, start = tasks.begin(key_task, given, self.robot.ankle_height)
+        index = jnp.int32(0)
+        step = self._task_step(key_step, given, task, index, start)
+        a_ff = control.feedforward(self.robot, dataclasses.replace(self.config.control, level_feet=True), start)
+        joints = control.denormalize(self.robot, jnp.clip(a_ff, -1.0, 1.0))
+        physics = Physics(
+            qpos=jnp.concatenate([start.trunk_position, start.trunk_orientation, joints]),
+            qvel=jnp.zeros(self.mj_model.nv),
+            warmstart=jnp.zeros(self.mj_model.nv),
+            boxes=self._boxes(task, index),
+        )
+        episode = Episode(
+            key=key,
+            given=given,
+            task=task,
+            step=step,
+            index=index,
+            tick=jnp.int32(0),
+            control=control.initial(a_ff),
+            feedback=jnp.zeros(self.action_size),
+        )
+        zero = jnp.float32(0)
+        names = [
+            *rewards.Terms._fields,
+            "ankle_error_cm",
+            "ankle_yaw_error_deg",
+            "trunk_error_cm",
+            "trunk_error_deg",
+        ]
+        return brax.envs.State(
+            pipeline_state=physics,
+            obs=self._observe(physics, episode, self._command(episode)),
+            reward=zero,
+            done=zero,
+            metrics=dict.fromkeys([*names, "fell", "nonfinite"], zero),
+            info={"episode": episode},
+        )
+
+    def step(self, state: brax.envs.State, action: Array) -> brax.envs.State:
+        """One policy step: the feedback is held while planner, feedforward, filter and PD run at 200 Hz."""
+        before, episode = state.pipeline_state, state.info["episode"]
+        a_fb = jnp.clip(self.config.control.feedback_scale * action, -1.0, 1.0)
+        advance = lambda carry, _: self._control_step(carry[0], carry[1], a_fb)  # noqa: E731
+        (physics, episode), qacc = jax.lax.scan(advance, (before, episode), length=self.substeps)
+
+        finite = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
+        physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
+        command = self._command(episode)
+        errors = nodes.difference(command.target, kinematics.measure(self.robot, physics.qpos))
+        terms = rewards.terms(
+            self.config.rewards.sharpness,
+            errors,
+            command.rates,
+            a_fb,
+            episode.feedback,
+            physics.qvel[6:],
+            jnp.where(finite, qacc[-1, 6:], 0.0),
+        )
+        episode = episode._replace(feedback=a_fb)
+        fell = self._fell(physics, errors)
+        return state.replace(
+            pipeline_state=physics,
+            obs=self._observe(physics, episode, command),
+            reward=rewards.total(self.config.rewards.weights, terms),
+            done=(fell | ~finite).astype(jnp.float32),
+            metrics={
+                **terms._asdict(),
+                **tasks.tracking_errors(errors),
+                "fell": fell.astype(jnp.float32),
+                "nonfinite": (~finite).astype(jnp.float32),
+            },
+            info={**state.info, "episode": episode},
+        )
+
+    def _control_step(self, physics: Physics, episode: Episode, a_fb: Array) -> tuple[tuple[Physics, Episode], Array]:
+        """One control step of 0.005 s: eqs (4)-(7), physics, clock. Also returns the joint accelerations, (18,)."""
+        a_ff = control.feedforward(self.robot, self.config.control, self._command(episode).target)
+        targets, memory = control.joint_targets(self.robot, self.config.control, episode.control, a_ff, a_fb)
+        physics = self._simulate(physics, targets)
+        episode = self._tick(episode._replace(control=memory))
+        return (physics._replace(boxes=self._boxes(episode.task, episode.index)), episode), physics.warmstart
+
+    def _simulate(self, physics: Physics, joint_targets: Array) -> Physics:
+        """MJX from t to t + 0.005 s with the PD controllers at the given joint targets, (12,) rad."""
+        data = self._blank.replace(
+            qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=joint_targets
+        )
+        if self.mj_model.nmocap:
+            data = data.replace(mocap_pos=physics.boxes)
+        data = mjx.step(self.mjx_model, data)
+        return physics._replace(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc)
+
+    def _tick(self, episode: Episode) -> Episode:
+        """The clock one control step on, into the next task step where this one is over."""
+        tick = episode.tick + 1
+        over = tick >= jnp.round(episode.step.period / self.robot.timestep)
+        key, key_step = jax.random.split(episode.key)
+        index = episode.index + 1
+        following = self._task_step(key_step, episode.given, episode.task, index, episode.step.end)
+        choose = lambda new, old: jnp.where(over, new, old)  # noqa: E731
+        return episode._replace(
+            key=key,
+            step=jax.tree.map(choose, following, episode.step),
+            index=choose(index, episode.index),
+            tick=choose(jnp.int32(0), tick),
+        )
+
+    def _task_step(
+        self, key: Array, given: tasks.Distribution, task: tasks.Task, index: Array, start: nodes.Nodes
+    ) -> planner.TaskStep:
+        return tasks.next_step(key, given, task, index, start, self.robot.ankle_height, self.robot.timestep)
+
+    def _command(self, episode: Episode) -> planner.Command:
+        return planner.command(episode.step, episode.tick * self.robot.timestep)
+
+    def _boxes(self, task: tasks.Task, index: Array) -> Array:
+        if not self.config.stairs:
+            return jnp.zeros((0, 3))
+        return terrain.stair_boxes(task.stairs, tasks.stance_level(task, index))
+
+    def _observe(self, physics: Physics, episode: Episode, command: planner.Command) -> Array:
+        """The flat observation of eq (8), (101,)."""
+        a_ff = control.feedforward(self.robot, self.config.control, command.target)
+        real = kinematics.measure(self.robot, physics.qpos)
+        return observation.flatten(observation.observe(command, real, physics.qpos, physics.qvel, a_ff, episode.feedback))
+
+    def _fell(self, physics: Physics, errors: nodes.NodeErrors) -> Array:
+        """() bool: tilt beyond the limit (the paper's rule), trunk far below its target, or an ankle lost."""
+        up = rotations.to_matrix(physics.qpos[3:7])[2]
+        tilted = up[2] < math.cos(math.radians(self.config.fall_tilt_deg))
+        sunk = (errors.trunk_position @ up) > self.config.fall_depth
+        lost = rewards.norm(errors.ankle_positions).max() > self.config.lost_ankle
+        return tilted | sunk | lost

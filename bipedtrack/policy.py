@@ -1,0 +1,236 @@
+"""The trained policy: the actor as a function, the file it travels in, and the controller that runs anywhere numpy runs.
+
+A policy file holds everything that acts between a command and the joint targets (network, normaliser, robot, control law,
+observation layout), so an exported policy cannot act otherwise than in training because something was left behind.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bipedtrack import checkpoint, config, control, kinematics, observation
+from bipedtrack.control import ControlConfig
+from bipedtrack.planner import Command
+from bipedtrack.robot import Robot
+from bipedtrack.rotations import Array, namespace
+
+KIND = "policy"
+ACTIVATIONS = ("swish", "tanh", "relu")
+
+
+class PolicyError(ValueError):
+    """A policy that does not fit this robot or this version; the message is one line."""
+
+
+class Network(NamedTuple):
+    """The actor's arrays: normaliser and dense layers, input to output."""
+
+    mean: Array  # (101,)
+    std: Array  # (101,)
+    weights: tuple[Array, ...]  # (inputs, outputs) each
+    biases: tuple[Array, ...]  # (outputs,) each
+
+
+def apply(network: Network, activation: str, flat_observation: Array) -> Array:
+    """The network's output (..., 12), the mean of the action distribution, for observations (..., 101)."""
+    xp = namespace(flat_observation)
+    hidden = (flat_observation - network.mean) / network.std
+    last = len(network.weights) - 1
+    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        hidden = hidden @ weight + bias
+        if i < last:
+            if activation == "swish":
+                hidden = (0.5 * hidden) * (1 + xp.tanh(0.5 * hidden))
+            elif activation == "tanh":
+                hidden = xp.tanh(hidden)
+            else:
+                hidden = xp.maximum(hidden, xp.zeros_like(hidden))
+    return hidden
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """What a policy file holds."""
+
+    network: Network
+    activation: str
+    settings: ControlConfig
+    policy_period: float  # s
+    robot: Robot
+    provenance: dict[str, Any]  # where it comes from: curriculum, seed, steps, versions
+
+    def feedback(self, flat_observation: Array) -> Array:
+        """a_fb (..., 12) in [-1, 1] for observations (..., 101), without exploration noise."""
+        output = apply(self.network, self.activation, flat_observation)
+        return namespace(output).clip(self.settings.feedback_scale * output, -1.0, 1.0)
+
+
+def save(policy: Policy, path: str | pathlib.Path) -> None:
+    """Writes a policy file, atomically. Raises checkpoint.RunError when it cannot be written."""
+    arrays = {"normalizer/mean": policy.network.mean, "normalizer/std": policy.network.std}
+    for i, (weight, bias) in enumerate(zip(policy.network.weights, policy.network.biases, strict=True)):
+        arrays |= {f"actor/{i}/weight": weight, f"actor/{i}/bias": bias}
+    robot_fields = vars(policy.robot)
+    arrays |= {f"robot/{k}": v for k, v in robot_fields.items() if isinstance(v, np.ndarray)}
+    meta = {
+        "observation": {"layout": observation.WIDTHS._asdict(), "hash": observation.layout_hash()},
+        "activation": policy.activation,
+        "control": config.to_dict(policy.settings),
+        "policy_period": policy.policy_period,
+        "robot": {k: v for k, v in robot_fields.items() if not isinstance(v, np.ndarray)},
+        "provenance": policy.provenance,
+    }
+    checkpoint.save_arrays(path, arrays, meta, KIND)
+
+
+def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
+    """A policy from its file, every byte and every name checked.
+
+    Args:
+      path: the file.
+      robot: the robot it is going to drive; a policy of another one is refused.
+
+    Raises:
+      checkpoint.CheckpointError: the file is missing, cut off, changed or no policy.
+      PolicyError: the file is intact but of another observation layout, robot or shape.
+    """
+    arrays, meta = checkpoint.load_arrays(path, KIND)
+    try:
+        if meta["observation"]["hash"] != observation.layout_hash():
+            raise PolicyError("was trained on another observation layout; train or export it with this version")
+        robot_meta = dict(meta["robot"]) | {k[6:]: v for k, v in arrays.items() if k.startswith("robot/")}
+        robot_meta["joint_names"] = tuple(robot_meta["joint_names"])
+        layers = sum(name.startswith("actor/") for name in arrays) // 2
+        policy = Policy(
+            network=Network(
+                mean=arrays["normalizer/mean"],
+                std=arrays["normalizer/std"],
+                weights=tuple(arrays[f"actor/{i}/weight"] for i in range(layers)),
+                biases=tuple(arrays[f"actor/{i}/bias"] for i in range(layers)),
+            ),
+            activation=meta["activation"],
+            settings=config.from_dict(ControlConfig, meta["control"], "control"),
+            policy_period=float(meta["policy_period"]),
+            robot=Robot(**robot_meta),
+            provenance=meta["provenance"],
+        )
+        _check(policy)
+        if robot is not None:
+            _check_robot(policy.robot, robot)
+    except (KeyError, TypeError, config.ConfigError) as error:
+        raise PolicyError(f"{path}: is no complete policy ({type(error).__name__}: {error})") from None
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
+    return policy
+
+
+def _check(policy: Policy) -> None:
+    """Raises PolicyError where shapes, types or values do not fit together."""
+    network, joints = policy.network, len(policy.robot.joint_names)
+    sizes = [observation.SIZE, *(weight.shape[-1] for weight in network.weights)]
+    wanted = {f"actor/{i}/weight": (w.shape, sizes[i : i + 2]) for i, w in enumerate(network.weights)}
+    wanted |= {f"actor/{i}/bias": (b.shape, [sizes[i + 1]]) for i, b in enumerate(network.biases)}
+    wanted |= {
+        "normalizer/mean": (network.mean.shape, sizes[:1]),
+        "normalizer/std": (network.std.shape, sizes[:1]),
+    }
+    joint_arrays = ("joint_low", "joint_high", "feedback_ratio", "kp", "kd", "torque_limit")
+    wanted |= {f"robot/{name}": (getattr(policy.robot, name).shape, [joints]) for name in joint_arrays}
+    for name, (found, right) in wanted.items():
+        if list(found) != list(right):
+            raise PolicyError(f"array {name} has shape {list(found)}; wanted {list(right)}")
+    if not network.weights or sizes[-1] != joints:
+        raise PolicyError(f"the network gives {sizes[-1]} numbers; wanted one for each of {joints} joints")
+    if policy.activation not in ACTIVATIONS:
+        raise PolicyError(f"activation {policy.activation!r} is unknown; wanted one of {', '.join(ACTIVATIONS)}")
+    for part in (network.mean, network.std, *network.weights, *network.biases):
+        if part.dtype != np.float32 or not np.isfinite(part).all():
+            raise PolicyError("the network must be of finite float32 numbers")
+    if not (network.std > 0).all():
+        raise PolicyError("the normaliser's standard deviations must be positive")
+
+
+def _check_robot(trained: Robot, wanted: Robot) -> None:
+    """Raises PolicyError where the policy was trained on another robot than the wanted one."""
+    for name, value in vars(wanted).items():
+        if name != "name" and not np.array_equal(np.asarray(getattr(trained, name)), np.asarray(value)):
+            raise PolicyError(
+                f"was trained on robot {trained.name!r} with another {name} than {wanted.name!r} has; "
+                "train a policy for this robot"
+            )
+
+
+def _as_float32(tree: Any) -> Any:
+    """The same struct of structs with its arrays in float32."""
+    if isinstance(tree, tuple):
+        return type(tree)(*(_as_float32(part) for part in tree))
+    return np.asarray(tree, np.float32)
+
+
+class Controller:
+    """The whole controller in numpy: measured state and command in, joint targets out, every 0.005 s.
+
+    >>> controller = Controller.load("policy.npz")
+    >>> controller.reset(qpos)
+    >>> targets = controller.step(qpos, qvel, command)
+
+    Needs numpy alone. One step takes well under a millisecond with one BLAS thread (OPENBLAS_NUM_THREADS=1).
+    """
+
+    def __init__(self, policy: Policy, feedback: bool = True):
+        """feedback=False leaves the feedforward alone: inverse kinematics, filter and PD."""
+        self.policy = policy
+        self.robot = policy.robot.cast(np.float32)
+        self.uses_feedback = feedback
+        self._hold = max(1, round(policy.policy_period / policy.robot.timestep))
+        self._tick = 0
+        self._feedback = np.zeros(len(policy.robot.joint_names), np.float32)
+        self._memory: control.ControlState | None = None
+
+    @classmethod
+    def load(cls, path: str | pathlib.Path, robot: Robot | None = None) -> Controller:
+        """The controller of a policy file; raises as `load` does."""
+        return cls(load(path, robot))
+
+    def reset(self, qpos: Array) -> None:
+        """Begins anew with a robot that stands at qpos (19,): trunk position, quaternion, joint angles."""
+        joints = np.asarray(qpos, np.float32)[7:]
+        if joints.shape != self._feedback.shape:
+            raise ValueError(f"qpos must have {7 + self._feedback.size} numbers, not {np.size(qpos)}")
+        self._memory = control.initial(control.normalize(self.robot, joints))
+        self._feedback = np.zeros_like(self._feedback)
+        self._tick = 0
+
+    def step(self, qpos: Array, qvel: Array, command: Command) -> np.ndarray:
+        """Joint targets (12,), rad, for the PD controllers.
+
+        Args:
+          qpos: (19,) trunk position m, quaternion w x y z, joint angles rad.
+          qvel: (18,) trunk velocity m/s in the world, angular velocity rad/s in F_B, joint velocities rad/s.
+          command: from `planner.command` or `footsteps.command_at`, in the world frame, at this instant.
+
+        Raises:
+          RuntimeError: before `reset`.
+        """
+        if self._memory is None:
+            raise RuntimeError("call reset(qpos) before the first step")
+        command = _as_float32(command)
+        a_ff = control.feedforward(self.robot, self.policy.settings, command.target)
+        if self.uses_feedback and self._tick % self._hold == 0:
+            self._feedback = self.policy.feedback(self.observe(qpos, qvel, command, a_ff))
+        targets, self._memory = control.joint_targets(self.robot, self.policy.settings, self._memory, a_ff, self._feedback)
+        self._tick += 1
+        return targets
+
+    def observe(self, qpos: Array, qvel: Array, command: Command, a_ff: Array | None = None) -> np.ndarray:
+        """The flat observation of eq (8), (101,) float32."""
+        qpos, qvel = np.asarray(qpos, np.float32), np.asarray(qvel, np.float32)
+        command = _as_float32(command)
+        if a_ff is None:
+            a_ff = control.feedforward(self.robot, self.policy.settings, command.target)
+        real = kinematics.measure(self.robot, qpos)
+        return observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, self._feedback))

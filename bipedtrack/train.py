@@ -1,0 +1,179 @@
+"""`python -m bipedtrack.train`: trains a tracking controller, from a curriculum to an exported policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+import pathlib
+import signal
+import sys
+from typing import Any, Literal, NoReturn
+
+import tyro
+
+from bipedtrack import checkpoint, config, curriculum, robot, versions
+
+EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
+EVALUATION_DIFFICULTY = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Trains a tracking controller: all stages of a curriculum, then a table and an exported policy."""
+
+    curriculum: str = "quick"
+    """A curriculum in curricula/ by its name, or a TOML file."""
+    out: pathlib.Path | None = None
+    """The run directory; runs/<curriculum>-<seed> when not given."""
+    seed: int = 0
+    """Everything random follows from it."""
+    resume: bool = False
+    """Goes on with the run in the run directory, with its own curriculum and seed."""
+    device: Literal["cpu", "gpu", "auto"] = "auto"
+    """Where to train; never falls back silently. auto: the best that JAX finds."""
+
+
+def main() -> None:
+    """The command line. Exit status 0 when trained, 2 for bad input, 130 when interrupted (resumable)."""
+    options = tyro.cli(Train, prog="python -m bipedtrack.train")
+    try:
+        versions.require()
+        run(options)
+    except (
+        versions.VersionError,
+        config.ConfigError,
+        robot.RobotError,
+        checkpoint.RunError,
+        checkpoint.CheckpointError,
+        DeviceError,
+    ) as error:
+        fail(str(error))
+
+
+def fail(message: str) -> NoReturn:
+    """One line on stderr and exit status 2."""
+    print(f"bipedtrack: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+class DeviceError(RuntimeError):
+    """The wanted device is not there; the message is one line."""
+
+
+def use_device(device: str) -> str:
+    """Makes JAX use a device and returns its description. Raises DeviceError where it is missing."""
+    if device != "auto":
+        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
+    logging.getLogger("jax._src.xla_bridge").setLevel(logging.CRITICAL)
+    import jax
+
+    try:
+        devices = jax.devices()
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise DeviceError(
+            f"--device {device}: JAX finds no such device ({reason}); use --device cpu, or "
+            "`pip install bipedtrack[cuda]` on a machine with an NVIDIA GPU"
+        ) from None
+    return f"{len(devices)} x {devices[0].device_kind}"
+
+
+def run(options: Train) -> None:
+    """Trains, exports and shows the table."""
+    if options.seed < 0:
+        raise config.ConfigError(f"--seed {options.seed}: must not be negative")
+    folder = options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
+    if options.resume:
+        directory = checkpoint.RunDirectory.open(folder)
+        plan = config.from_dict(curriculum.Curriculum, directory.settings["curriculum"], str(folder / "run.json"))
+        seed = int(directory.settings["seed"])
+    else:
+        plan, seed = curriculum.load(options.curriculum), options.seed
+        robot.load(plan.robot)
+        settings = {"curriculum": config.to_dict(plan), "seed": seed, "versions": _versions()}
+        directory = checkpoint.RunDirectory.create(folder, settings)
+    try:
+        device = use_device(options.device)
+        _train(directory, plan, seed, device, options)
+    finally:
+        directory.close()
+
+
+def _versions() -> dict[str, str | None]:
+    return {row.name: row.found for row in versions.check()}
+
+
+def _train(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed: int, device: str, options: Train) -> None:
+    import rich.console
+
+    from bipedtrack import policy, training
+    from bipedtrack.progress import Progress
+
+    stop = _stop_on_signals()
+    calls = curriculum.calls(plan)
+    found = directory.latest()
+    finished = 0 if found is None else found[0] + 1
+    with Progress(directory.path, plan, calls, sum(call.steps for call in calls[:finished])) as progress:
+        for warning in directory.warnings:
+            progress.say(f"warning: {warning}")
+        progress.say(
+            f"{plan.name}, seed {seed}, on {device}: {len(plan.stages)} stages, {len(calls)} PPO calls, "
+            f"{sum(call.steps for call in calls) / 1e6:.1f} M policy steps, in {directory.path}"
+            + (f"; {finished} calls are done" if finished else "")
+        )
+        try:
+            params = training.train(plan, directory, seed, progress, stop)
+        except training.Stopped:
+            saved = directory.latest()
+            progress.say(
+                f"stopped; {0 if saved is None else saved[0] + 1} of {len(calls)} calls are saved. Go on with:\n"
+                f"  python -m bipedtrack.train --resume --out {directory.path}"
+            )
+            sys.exit(130)
+    trained = training.to_policy(plan, training.to_arrays(params), training.provenance(plan, seed, len(calls)))
+    path = directory.path / "policy.npz"
+    policy.save(trained, path)
+    console = rich.console.Console()
+    if plan.evaluation_episodes:
+        _show_table(directory, plan, trained, console)
+    console.print(f"policy: {path}", highlight=False, soft_wrap=True)
+
+
+def _show_table(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, trained: Any, console: Any) -> None:
+    """Evaluates inverse kinematics alone and the trained policy, prints the table and writes table.json."""
+    from bipedtrack import evaluation
+
+    difficulty = EVALUATION_DIFFICULTY
+    rows: dict[str, list[evaluation.Row]] = {}
+    for name, controller in (("inverse kinematics", None), ("trained", trained)):
+        console.print(f"evaluating {name} (compiling takes about half a minute)", highlight=False)
+        rows[name] = evaluation.by_kind(plan, controller, difficulty, plan.evaluation_episodes, EVALUATION_SEED)
+    console.print(evaluation.comparison(plan, difficulty, rows))
+    for name in rows:
+        flat = evaluation.level_ground(rows[name])
+        console.print(
+            f"level ground, {name}: {100 * flat.survival:.0f} % without a fall, lasts {flat.seconds:.1f} s, "
+            f"ankles {flat.ankle_error_cm:.1f} cm",
+            highlight=False,
+        )
+    record = {name: [dataclasses.asdict(row) for row in table] for name, table in rows.items()}
+    checkpoint.write_json(directory.path / "table.json", {"difficulty": difficulty, "seed": EVALUATION_SEED, **record})
+
+
+def _stop_on_signals() -> Any:
+    """A function that tells whether SIGINT or SIGTERM came; a second one of them ends the program at once."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        asked.append(number)
+        signal.signal(number, signal.SIG_DFL)
+        print("\nstopping after the present updates; the last finished call is saved", file=sys.stderr)
+
+    signal.signal(signal.SIGINT, ask)
+    signal.signal(signal.SIGTERM, ask)
+    return lambda: bool(asked)
+
+
+if __name__ == "__main__":
+    main()

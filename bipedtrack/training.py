@@ -1,0 +1,225 @@
+"""Stages and lessons as brax PPO calls, one after another: the only module that knows brax's argument names.
+
+A call is a pure function of (parameters, call, run's seed). A run that was killed repeats its unfinished call and ends in
+bitwise the same parameters on the same machine; what a call costs to repeat is set by the curriculum (`parts`).
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks
+from brax.training.agents.ppo import train as ppo
+from flax import linen
+
+from bipedtrack import autoreset, curriculum, env, observation, policy, robot, tasks, versions
+from bipedtrack.checkpoint import CheckpointError, RunDirectory
+from bipedtrack.progress import Progress
+
+_UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
+_ACTIVATIONS = {"swish": linen.swish, "tanh": linen.tanh, "relu": linen.relu}
+assert set(_ACTIVATIONS) == set(policy.ACTIVATIONS)
+
+Params = Any  # brax's (normaliser state, policy parameters, value parameters)
+
+
+class Stopped(Exception):
+    """Somebody asked the training to stop; everything up to the last finished call is saved."""
+
+
+def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, difficulty: float) -> env.TrackingEnv:
+    """The environment of a stage at a difficulty; only a stage with stairs has boxes."""
+    given = tasks.distribution(config.ranges, stage.shares, difficulty, stage.hold_share, stage.hold_after)
+    settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
+    return env.TrackingEnv(robot.load(config.robot), settings, given)
+
+
+def train(
+    config: curriculum.Curriculum,
+    run: RunDirectory,
+    seed: int,
+    progress: Progress,
+    wants_to_stop: Callable[[], bool],
+) -> Params:
+    """Runs the calls that are not yet finished, saving after each, and returns the last parameters.
+
+    Raises Stopped within a few updates after `wants_to_stop` turned true, and RunError when a checkpoint cannot be written.
+    """
+    found = run.latest()
+    params = None if found is None else from_arrays(config, found[1])
+    for call in curriculum.calls(config)[0 if found is None else found[0] + 1 :]:
+        params = _run_call(config, call, seed, params, progress, wants_to_stop)
+        run.save_checkpoint(call.index, to_arrays(params), {"seed": seed})
+        progress.finished(call)
+    return params
+
+
+def _run_call(
+    config: curriculum.Curriculum,
+    call: curriculum.Call,
+    seed: int,
+    params: Params | None,
+    progress: Progress,
+    wants_to_stop: Callable[[], bool],
+) -> Params:
+    """One `ppo.train` from the given parameters. Steps are rounded up to whole epochs of whole updates."""
+    ppo_config, network = config.ppo, config.network
+    updates = math.ceil(call.steps / ppo_config.steps_per_update)
+    epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
+    the_env = make_env(config, call.stage, call.lesson.difficulty)
+
+    def report(steps: int, metrics: dict[str, Any]) -> None:
+        # brax also reports after each epoch, without a word on episodes
+        if "episode/length" in metrics:
+            progress.update(call, steps, _figures(metrics, config.policy_period))
+
+    def look(steps: int, make_policy: Any, params: Any) -> None:
+        if wants_to_stop():
+            raise Stopped
+
+    def wrap(environment: env.TrackingEnv, episode_length: int, **unused: Any) -> autoreset.AutoReset:
+        return autoreset.AutoReset(environment, episode_length)
+
+    progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
+    _, params, _ = ppo.train(
+        environment=the_env,
+        wrap_env_fn=wrap,
+        num_timesteps=updates * ppo_config.steps_per_update,
+        num_evals=epochs + 1,
+        run_evals=False,
+        episode_length=config.episode_length,
+        num_envs=ppo_config.num_envs,
+        unroll_length=ppo_config.unroll_length,
+        batch_size=ppo_config.num_envs // ppo_config.num_minibatches,
+        num_minibatches=ppo_config.num_minibatches,
+        num_updates_per_batch=ppo_config.num_epochs,
+        learning_rate=call.learning_rate,
+        entropy_cost=call.entropy_cost,
+        clipping_epsilon=call.clipping_epsilon,
+        discounting=ppo_config.discount,
+        gae_lambda=ppo_config.gae_lambda,
+        max_grad_norm=ppo_config.max_grad_norm,
+        reward_scaling=ppo_config.reward_scaling,
+        normalize_observations=True,
+        normalize_observations_std_eps=network.normalizer_floor,
+        network_factory=functools.partial(make_networks, network),
+        seed=call_seed(seed, call.index),
+        restore_params=params,
+        log_training_metrics=True,
+        training_metrics_steps=5 * ppo_config.steps_per_update,
+        progress_fn=report,
+        policy_params_fn=look,
+    )
+    return params
+
+
+def make_networks(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> networks.PPONetworks:
+    """Brax's actor and critic, as a `network_factory`: Gaussian actions whose deviation is learned, not squashed."""
+    return networks.make_ppo_networks(
+        *args,
+        **kwargs,
+        policy_hidden_layer_sizes=network.actor,
+        value_hidden_layer_sizes=network.critic,
+        activation=_ACTIVATIONS[network.activation],
+        distribution_type="normal",
+        noise_std_type="log",
+        init_noise_std=network.initial_noise,
+    )
+
+
+def call_seed(seed: int, index: int) -> int:
+    """The seed of a call, from the run's seed and the call's index; in [0, 2^31)."""
+    return int(np.random.SeedSequence([seed, index]).generate_state(1)[0] >> 1)
+
+
+def _figures(metrics: dict[str, Any], policy_period: float) -> dict[str, float]:
+    """What people want to see of brax's metrics: means over the latest episodes that ended."""
+    steps = metrics["episode/length"]
+    per_step = {k[8:-9]: float(v) for k, v in metrics.items() if k.startswith("episode/") and k.endswith("_per_step")}
+    learner = ("kl_mean", "policy_dist_mean_std", "policy_loss", "v_loss", "entropy_loss")
+    return {
+        "episode_seconds": float(steps) * policy_period,
+        "falls": per_step.pop("fell") * float(steps),
+        "nonfinite": per_step.pop("nonfinite") * float(steps),
+        "reward_per_step": float(metrics["episode/sum_reward"]) / max(float(steps), 1.0),
+        **per_step,
+        **{name: float(metrics[f"episode/{name}"]) for name in learner},
+    }
+
+
+def _template(config: curriculum.Curriculum) -> Params:
+    """Shapes and types of the parameters, without computing any."""
+
+    def build() -> Params:
+        made = make_networks(config.network, observation.SIZE, len(robot.load(config.robot).joint_names))
+        key = jax.random.PRNGKey(0)
+        normalizer = running_statistics.init_state(
+            specs.Array((observation.SIZE,), np.dtype("float32")), std_eps=config.network.normalizer_floor
+        )
+        return normalizer, made.policy_network.init(key), made.value_network.init(key)
+
+    return jax.eval_shape(build)
+
+
+def _named_leaves(params: Params) -> tuple[dict[str, Any], Any]:
+    """The leaves by their path, and the tree's structure."""
+    leaves, structure = jax.tree_util.tree_flatten_with_path(params)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}, structure
+
+
+def to_arrays(params: Params) -> dict[str, np.ndarray]:
+    """Brax's parameters as named arrays for a checkpoint."""
+    return {name: np.asarray(leaf) for name, leaf in _named_leaves(params)[0].items()}
+
+
+def from_arrays(config: curriculum.Curriculum, arrays: dict[str, np.ndarray]) -> Params:
+    """Brax's parameters from a checkpoint's arrays. Raises CheckpointError where they do not fit the curriculum."""
+    wanted, structure = _named_leaves(_template(config))
+    if set(wanted) != set(arrays):
+        odd = sorted(set(wanted) ^ set(arrays))[0]
+        raise CheckpointError(f"checkpoint does not fit the curriculum's networks: {odd} is on one side only")
+    for name, leaf in wanted.items():
+        if arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
+            raise CheckpointError(
+                f"checkpoint does not fit the curriculum's networks: {name} is {arrays[name].dtype}"
+                f"{list(arrays[name].shape)}, wanted {leaf.dtype}{list(leaf.shape)}"
+            )
+    return jax.tree_util.tree_unflatten(structure, [jax.numpy.asarray(arrays[name]) for name in wanted])
+
+
+def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], provenance: dict[str, Any]) -> policy.Policy:
+    """The exported policy of a checkpoint's arrays: the actor's mean, its normaliser and all that surrounds them."""
+    normalizer, actor, _ = from_arrays(config, arrays)
+    layers = actor["params"]["MLP_0"]
+    dense = [layers[f"hidden_{i}"] for i in range(len(config.network.actor))] + [actor["params"]["Dense_0"]]
+    return policy.Policy(
+        network=policy.Network(
+            mean=np.asarray(normalizer.mean),
+            std=np.asarray(normalizer.std),
+            weights=tuple(np.asarray(layer["kernel"]) for layer in dense),
+            biases=tuple(np.asarray(layer["bias"]) for layer in dense),
+        ),
+        activation=config.network.activation,
+        settings=config.control,
+        policy_period=config.policy_period,
+        robot=robot.load(config.robot),
+        provenance=provenance,
+    )
+
+
+def provenance(config: curriculum.Curriculum, seed: int, finished_calls: int) -> dict[str, Any]:
+    """Where a policy comes from: curriculum, seed, steps and versions."""
+    return {
+        "curriculum": config.name,
+        "seed": seed,
+        "steps": sum(call.steps for call in curriculum.calls(config)[:finished_calls]),
+        "bipedtrack": importlib.metadata.version("bipedtrack"),
+        "versions": {row.name: row.found for row in versions.check()},
+    }
