@@ -7,6 +7,7 @@ from bipedtrack import __version__, versions
 COMMANDS = {
     "train": "train a policy through the stages of a curriculum",
     "export": "write the policy of a training run to one file that numpy alone can run",
+    "simulate": "drive the robot through a footstep script in MuJoCo C",
     "doctor": "check versions, devices, rendering and the physics of this machine",
 }
 

@@ -15,12 +15,19 @@ import jax.numpy as jnp
 from bipedtrack.env import TrackingEnv
 from bipedtrack.rotations import Array
 
+EVENTS = ("fell", "nonfinite")  # metrics that happen at most once in an episode
+
+
+def _sum_name(metric: str) -> str:
+    """The name of a metric's sum over an episode: brax divides those named `*_per_step` by the length."""
+    return metric if metric in EVENTS else f"{metric}_per_step"
+
 
 class AutoReset(brax.envs.Wrapper):
     """A batch of TrackingEnvs for brax's ppo.train, with the info that it reads.
 
     info: `truncation` (1 on the step that begins a new episode), `episode_done` (1 on the last step of an episode, however
-    it ended), `episode_metrics` (sums over the episode so far; brax divides those named `*_per_step` by `length`).
+    it ended), `episode_metrics` (sums over the episode so far).
     """
 
     env: TrackingEnv
@@ -44,7 +51,7 @@ class AutoReset(brax.envs.Wrapper):
     def _with_info(self, state: brax.envs.State, truncation: float) -> brax.envs.State:
         """The first state of an episode with its sums at zero."""
         zero = jnp.float32(0)
-        sums = {"sum_reward": zero, "length": zero} | {f"{name}_per_step": zero for name in state.metrics}
+        sums = {"sum_reward": zero, "length": zero} | {_sum_name(name): zero for name in state.metrics}
         info = {"truncation": jnp.float32(truncation), "episode_done": zero, "episode_metrics": sums}
         return state.replace(info={**state.info, **info})
 
@@ -55,7 +62,7 @@ class AutoReset(brax.envs.Wrapper):
         sums = {
             "sum_reward": sums["sum_reward"] + moved.reward,
             "length": sums["length"] + 1,
-            **{f"{name}_per_step": sums[f"{name}_per_step"] + value for name, value in moved.metrics.items()},
+            **{_sum_name(name): sums[_sum_name(name)] + value for name, value in moved.metrics.items()},
         }
         late = (sums["length"] >= self.episode_length).astype(jnp.float32)
         info = {

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import pathlib
 from typing import Annotated
 
 import tyro
 
 from bipedtrack import checkpoint, config, curriculum, robot, versions
-from bipedtrack.train import fail
+from bipedtrack.messages import fail
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +52,8 @@ def export(run: pathlib.Path, out: pathlib.Path) -> None:
     found = directory.latest()
     if found is None:
         raise checkpoint.CheckpointError(f"{run}: has no checkpoint yet; its first PPO call is not finished")
-    from bipedtrack import policy, training
+    with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
+        from bipedtrack import policy, training
 
     index, arrays, _ = found
     policy.save(training.to_policy(plan, arrays, training.provenance(plan, settings["seed"], index + 1)), out)

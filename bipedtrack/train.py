@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import logging
 import os
 import pathlib
 import signal
 import sys
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import tyro
 
 from bipedtrack import checkpoint, config, curriculum, robot, versions
+from bipedtrack.messages import fail
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
 EVALUATION_DIFFICULTY = 0.5
@@ -49,12 +52,6 @@ def main() -> None:
         DeviceError,
     ) as error:
         fail(str(error))
-
-
-def fail(message: str) -> NoReturn:
-    """One line on stderr and exit status 2."""
-    print(f"bipedtrack: {message}", file=sys.stderr)
-    sys.exit(2)
 
 
 class DeviceError(RuntimeError):
@@ -107,7 +104,8 @@ def _versions() -> dict[str, str | None]:
 def _train(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed: int, device: str, options: Train) -> None:
     import rich.console
 
-    from bipedtrack import policy, training
+    with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
+        from bipedtrack import policy, training
     from bipedtrack.progress import Progress
 
     stop = _stop_on_signals()

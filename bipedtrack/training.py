@@ -7,7 +7,6 @@ bitwise the same parameters on the same machine; what a call costs to repeat is 
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import math
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +18,7 @@ from brax.training.agents.ppo import networks
 from brax.training.agents.ppo import train as ppo
 from flax import linen
 
-from bipedtrack import autoreset, curriculum, env, observation, policy, robot, tasks, versions
+from bipedtrack import __version__, autoreset, curriculum, env, observation, policy, robot, tasks, versions
 from bipedtrack.checkpoint import CheckpointError, RunDirectory
 from bipedtrack.progress import Progress
 
@@ -141,14 +140,14 @@ def call_seed(seed: int, index: int) -> int:
 
 def _figures(metrics: dict[str, Any], policy_period: float) -> dict[str, float]:
     """What people want to see of brax's metrics: means over the latest episodes that ended."""
-    steps = metrics["episode/length"]
+    steps = float(metrics["episode/length"])
     per_step = {k[8:-9]: float(v) for k, v in metrics.items() if k.startswith("episode/") and k.endswith("_per_step")}
     learner = ("kl_mean", "policy_dist_mean_std", "policy_loss", "v_loss", "entropy_loss")
     return {
-        "episode_seconds": float(steps) * policy_period,
-        "falls": per_step.pop("fell") * float(steps),
-        "nonfinite": per_step.pop("nonfinite") * float(steps),
-        "reward_per_step": float(metrics["episode/sum_reward"]) / max(float(steps), 1.0),
+        "episode_seconds": steps * policy_period,
+        "falls": float(metrics["episode/fell"]),
+        "nonfinite": float(metrics["episode/nonfinite"]),
+        "reward_per_step": float(metrics["episode/sum_reward"]) / max(steps, 1.0),
         **per_step,
         **{name: float(metrics[f"episode/{name}"]) for name in learner},
     }
@@ -220,6 +219,6 @@ def provenance(config: curriculum.Curriculum, seed: int, finished_calls: int) ->
         "curriculum": config.name,
         "seed": seed,
         "steps": sum(call.steps for call in curriculum.calls(config)[:finished_calls]),
-        "bipedtrack": importlib.metadata.version("bipedtrack"),
+        "bipedtrack": __version__,
         "versions": {row.name: row.found for row in versions.check()},
     }

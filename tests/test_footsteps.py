@@ -1,0 +1,449 @@
+"""Footstep scripts: their commands worked by hand, their defaults, and every way they can be wrong."""
+
+import dataclasses
+import itertools
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from bipedtrack import footsteps, kinematics, nodes, robot, rotations
+from bipedtrack.footsteps import Script, ScriptError
+
+HEADER = "foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw\n"
+WALK = """# a short walk and a bow
+foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw
+left,0.2,0.1,0,0,0.5,0.06
+
+right,0.4,-0.1,0,0.2,0.602,,0.32,0.01,0.7,0,0.1,0.1
+both,,,,,1,,,,0.68,,0.15
+both,,,,,0.25
+"""
+STAIRS = """# box 0.8 0 0 0 0.8 1 0.1
+# box 0.95 0 0.1 0 0.5 1 0.1,,,,,,
+foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw
+left,0.25,0.1
+right,0.5,-0.1
+left,0.8,0.1
+right,0.85,-0.1,0.2
+left,0.95
+"""
+# the workspace that the numbers below are worked out for
+RANGER = dataclasses.replace(
+    robot.load(),
+    leg_length=np.array([0.35, 0.74]),
+    joint_low=np.radians([-45, -30, -100, 0, -75, -30] * 2),
+    joint_high=np.radians([45, 30, 40, 140, 45, 30] * 2),
+)
+
+
+def parse(rows: str, header: str = HEADER) -> Script:
+    return footsteps.parse(header + rows, RANGER, "walk.csv")
+
+
+def problems(text: str) -> list[str]:
+    with pytest.raises(ScriptError) as caught:
+        footsteps.parse(text, RANGER, "walk.csv")
+    return str(caught.value).split("\n")
+
+
+def turned(target: np.ndarray, real: np.ndarray) -> float:
+    """The angle, rad, between two orientations."""
+    turn = rotations.multiply(rotations.conjugate(real), target)
+    return float(np.linalg.norm(rotations.to_rotation_vector(turn)))
+
+
+def test_commands_of_a_script_worked_by_hand() -> None:
+    script = parse(WALK, header="")
+    assert script.lines == (3, 5, 6, 7)
+    assert [step.period for step in script.steps] == pytest.approx([0.5, 0.6, 1.0, 0.25])
+    assert footsteps.duration(script) == pytest.approx(2.35)
+    assert all(part.dtype == np.float64 for step in script.steps for part in (*step.start, *step.end, *step[2:]))
+    every = list(footsteps.commands(script, 0.005))
+    assert len(every) == 470
+
+    # the middle of the first step: the middle control point is half way, the curve is at its top, 0.06 m up;
+    # the trunk, which goes from 0 to the middle of 0.2 and 0, is half way there
+    middle = every[50]
+    np.testing.assert_allclose(middle.target.ankle_positions, [[0.1, 0.1, 0.1], [0, -0.1, 0.04]], atol=1e-12)
+    np.testing.assert_allclose(middle.target.trunk_position, [0.05, 0, 0.75], atol=1e-12)
+    np.testing.assert_allclose(middle.rates.trunk_velocity, [0.2, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(middle.timer, [0.25, 0], atol=1e-12)
+    np.testing.assert_allclose(middle.end.ankle_positions, [[0.2, 0.1, 0.04], [0, -0.1, 0.04]], atol=1e-12)
+    np.testing.assert_allclose(middle.end.trunk_position, [0.1, 0, 0.75], atol=1e-12)
+
+    # a third of the second step, 0.2 s of 0.6 s (0.602 s rounded): the yaw has come by 3/9 - 2/27 of its way
+    third = every[100 + 40]
+    assert third.target.ankle_yaws == pytest.approx([0, 0.2 * 7 / 27])
+    np.testing.assert_allclose(third.target.trunk_position, [0.1 + 0.22 / 3, 0.01 / 3, 0.75 - 0.05 / 3])
+    np.testing.assert_allclose(third.timer, [0, 0.4], atol=1e-12)
+    np.testing.assert_allclose(every[160].target.ankle_positions[1, 2], 0.04 + 0.08, atol=1e-12)  # default lift
+
+    # the bow begins where the second step ended and ends on defaults but for the given height and pitch
+    start, end = every[220].target, script.steps[2].end
+    np.testing.assert_allclose(start.trunk_position, [0.32, 0.01, 0.7], atol=1e-12)
+    assert turned(start.trunk_orientation, rotations.from_euler(0.0, 0.1, 0.1)) < 1e-12
+    np.testing.assert_allclose(end.trunk_position, [0.3, 0, 0.68], atol=1e-12)
+    assert turned(end.trunk_orientation, rotations.from_euler(0.0, 0.15, 0.1)) < 1e-12
+    np.testing.assert_array_equal(end.ankle_positions, script.steps[1].end.ankle_positions)
+    assert not every[300].timer.any()
+    assert np.linalg.norm(every[300].rates.trunk_velocity) == pytest.approx(math.hypot(0.02, 0.01, 0.02))
+
+    # the hold: every target stays where the bow has put it
+    for command in every[420:]:
+        for held, left in zip(command.target, end, strict=True):
+            np.testing.assert_allclose(held, left, rtol=0, atol=1e-15)
+        assert max(np.abs(rate).max() for rate in command.rates) < 1e-12
+
+
+def test_defaults() -> None:
+    step, again, turn, bare, hold = parse("left\nright,0.1\nleft,,,,0.4\nboth,,,,,,,0.06\nboth").steps
+    # stepping on the spot
+    np.testing.assert_array_equal(step.end.ankle_positions, [[0, 0.1, 0.04], [0, -0.1, 0.04]])
+    np.testing.assert_allclose(step.end.trunk_position, [0, 0, 0.75])
+    np.testing.assert_array_equal(step.end.trunk_orientation, [1, 0, 0, 0])
+    np.testing.assert_array_equal(step.swing, [1, 0])
+    np.testing.assert_array_equal(step.lift, [0.08, 0])
+    assert [s.period for s in (step, bare, hold)] == pytest.approx([0.55] * 3)
+    # y and yaw stay, the trunk is midway, its yaw the mean
+    np.testing.assert_allclose(again.end.ankle_positions[1], [0.1, -0.1, 0.04])
+    np.testing.assert_allclose(again.end.trunk_position, [0.05, 0, 0.75])
+    assert turn.end.ankle_yaws == pytest.approx([0.4, 0])
+    assert turned(turn.end.trunk_orientation, rotations.from_yaw(np.float64(0.2))) < 1e-12
+    # one cell of the trunk moves it and leaves the rest to the defaults
+    np.testing.assert_allclose(bare.end.trunk_position, [0.06, 0, 0.75])
+    assert not bare.swing.any()
+    assert hold.end is bare.end
+    # on the spot is where the foot is, not where it was
+    np.testing.assert_allclose(parse("left,0.1,0.12\nleft").steps[1].end.ankle_positions[0], [0.1, 0.12, 0.04])
+
+
+def test_a_hold_keeps_a_posture_that_is_not_the_default() -> None:
+    leaning = parse("left,0.2,,,,,,0.12,0.02,0.7,0.05,0.1,0.1\nboth,,,,,0.1").steps
+    for kept, left in zip(leaning[1].end, leaning[0].end, strict=True):
+        np.testing.assert_array_equal(kept, left)
+    np.testing.assert_array_equal(leaning[1].end.trunk_position, [0.12, 0.02, 0.7])
+
+
+def test_yaw_counts_modulo_a_whole_turn_and_goes_the_shorter_way() -> None:
+    yaws = [f"{side},{x},{y},0,{yaw}" for yaw in np.linspace(0.4, 6.8, 17) for side, x, y in (
+        ("left", -0.1 * math.sin(yaw), 0.1 * math.cos(yaw)), ("right", 0.1 * math.sin(yaw), -0.1 * math.cos(yaw)),
+    )]  # fmt: skip
+    end = parse("\n".join(yaws)).steps[-1].end
+    assert end.ankle_yaws == pytest.approx([6.8, 6.8])
+    assert turned(end.trunk_orientation, rotations.from_yaw(np.float64(6.8))) < 1e-9
+    trunk = parse(f"both,,,,,,,,,,,,{2 * math.pi + 0.1}").steps[0].end.trunk_orientation
+    np.testing.assert_allclose(trunk, [math.cos(0.05), 0, 0, math.sin(0.05)])  # and not minus this
+    step = parse(f"left,,,,{2 * math.pi + 0.3}").steps[0]
+    assert step.end.ankle_yaws[0] == pytest.approx(0.3)
+    assert turned(step.end.trunk_orientation, rotations.from_yaw(np.float64(0.15))) < 1e-9
+
+
+def test_columns_in_any_order_quotes_padding_and_comments() -> None:
+    text = 'trunk_yaw,"trunk_pitch",trunk_roll,trunk_z,trunk_y,trunk_x,lift,period,yaw,z,y,x,foot,,\r\n'
+    text += '#left,9\r\n,,,,,,,0.4,,0,0.1, 0.2 ,"left",,\r\n,,,,,,,,,,,,\r\n  # boxes: none\r\n'
+    script = parse(text, header="")
+    assert script.lines == (3,)
+    np.testing.assert_allclose(script.steps[0].end.ankle_positions[0], [0.2, 0.1, 0.04])
+    assert script.boxes == ()
+
+
+def test_an_empty_height_is_that_of_the_ground() -> None:
+    script = parse(STAIRS, header="")
+    heights = [step.end.ankle_positions[:, 2] - RANGER.ankle_height for step in script.steps]
+    np.testing.assert_allclose(heights, [[0, 0], [0, 0.1], [0.2, 0.1], [0.2, 0.2], [0.2, 0.2]], atol=1e-12)
+    trunk = [step.end.trunk_position[2] for step in script.steps]
+    np.testing.assert_allclose(trunk, [0.75, 0.8, 0.9, 0.95, 0.95])
+    # the swing rises over the higher end
+    top = max(c.target.ankle_positions[1, 2] for c in itertools.islice(footsteps.commands(script, 0.005), 110, 220))
+    assert top == pytest.approx(0.04 + 0.1 + 0.08, abs=0.01)
+
+
+def test_boxes_stand_in_the_simulator_where_the_script_says() -> None:
+    script = parse("# box 0.6 0.1 0.3 0.5 0.4 0.3 0.2\nleft")
+    box = script.boxes[0]
+    model = robot.build_model("ranger_max", boxes=[box.size for box in script.boxes])
+    data = mujoco.MjData(model)
+    data.mocap_pos[0], data.mocap_quat[0] = box.position, box.orientation
+    mujoco.mj_kinematics(model, data)
+    geom = model.geom("box_0").id
+    local = model.geom_size[geom] * [[1, 1, -1], [-1, 1, -1], [-1, -1, 1]]
+    corners = data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
+    np.testing.assert_allclose(corners[:, :2], box.corners[:3], atol=1e-12)
+    np.testing.assert_allclose(corners[:, 2], [0.3, 0.3, 0.5], atol=1e-12)
+    # length along its own x, which points 0.5 rad to the left
+    along = (corners[0] - corners[1])[:2]
+    np.testing.assert_allclose(along, [0.4 * math.cos(0.5), 0.4 * math.sin(0.5)], atol=1e-12)
+
+
+def test_the_start_is_a_stand() -> None:
+    qpos = footsteps.initial_qpos(RANGER)
+    for real, wanted in zip(kinematics.measure(RANGER, qpos), footsteps.initial_nodes(RANGER), strict=True):
+        np.testing.assert_allclose(real, wanted, atol=1e-9)
+    first = footsteps.command_at(parse("left,0.1"), 0.0)
+    for target, wanted in zip(first.target, footsteps.initial_nodes(RANGER), strict=True):
+        np.testing.assert_array_equal(target, wanted)
+
+
+@pytest.mark.parametrize("text", [WALK, STAIRS])
+def test_inverse_kinematics_puts_the_feet_on_the_scripted_footholds(text: str) -> None:
+    script = parse(text, header="")
+    model = robot.build_model("ranger_max")
+    data = mujoco.MjData(model)
+    for step in script.steps:
+        end = footsteps.planner.command(step, step.period).target
+        # the target reaches the end of the step, and is in reach as it is
+        ankles, yaws = nodes.ankles_in_trunk_frame(end)
+        assert kinematics.reachable(RANGER, ankles, yaws, 1e-9)
+        joints = kinematics.inverse(RANGER, ankles, yaws)
+        data.qpos[:] = np.concatenate([end.trunk_position, end.trunk_orientation, joints])
+        mujoco.mj_kinematics(model, data)
+        feet = np.array([data.xpos[model.body(f"{leg}_foot").id] for leg in robot.LEGS])
+        np.testing.assert_allclose(feet, step.end.ankle_positions, rtol=0, atol=1e-6)
+        if abs(step.end.trunk_orientation[1:3]).max() < 1e-9:  # feet are level where the trunk is (eq 1)
+            heading = np.array([data.xmat[model.body(f"{leg}_foot").id].reshape(3, 3)[:, 0] for leg in robot.LEGS])
+            wanted = [[math.cos(yaw), math.sin(yaw), 0] for yaw in step.end.ankle_yaws]
+            np.testing.assert_allclose(heading, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("text", [WALK, STAIRS])
+def test_targets_go_on_smoothly_from_step_to_step(text: str) -> None:
+    script = parse(text, header="")
+    targets = [c.target for c in footsteps.commands(script, 0.005, footsteps.duration(script) + 0.1)]
+    assert len(targets) == round(footsteps.duration(script) / 0.005) + 20
+    # 0.55 m in 0.5 s, at most five times the mean speed at the ends of a fourth-order curve
+    limits = {
+        "trunk_position": 0.005,
+        "trunk_orientation": 0.005,
+        "ankle_positions": 0.03,
+        "ankle_yaws": 0.005,
+    }
+    for name, limit in limits.items():
+        path = np.array([getattr(target, name) for target in targets])
+        assert np.abs(np.diff(path, axis=0)).max() < limit, name
+    for before, after in itertools.pairwise(script.steps):
+        assert after.start is before.end
+    for end, target in zip(script.steps[-1].end, targets[-1], strict=True):
+        np.testing.assert_allclose(target, end, atol=1e-12)
+
+
+def test_the_clock_counts_whole_control_steps() -> None:
+    script = parse("left,0.1,,,,0.41\nright,0.1,,,,0.4175\nboth,,,,,0.3")
+    ticks = [82, 84, 60]  # 0.4175 s is half way between 83 and 84 control steps
+    assert [round(step.period / 0.005) for step in script.steps] == ticks
+    assert all(step.period == round(step.period / 0.005) * 0.005 for step in script.steps)
+    every = list(footsteps.commands(script, 0.005))
+    assert len(every) == sum(ticks)
+    timers = np.array([command.timer for command in every])
+    np.testing.assert_allclose(timers[:82, 0], 0.005 * np.arange(82, 0, -1), atol=1e-12)
+    np.testing.assert_allclose(timers[82:166, 1], 0.005 * np.arange(84, 0, -1), atol=1e-12)
+    assert not timers[:82, 1].any() and not timers[82:, 0].any() and not timers[166:].any()
+
+    # the same by time, before the start and after the end too
+    for tick, command in enumerate(every):
+        at = footsteps.command_at(script, tick * 0.005)
+        for a, b in zip((*at.target, *at.rates, at.timer), (*command.target, *command.rates, command.timer), strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
+    assert footsteps.command_at(script, -1.0).timer[0] == pytest.approx(0.41)
+    for late in (
+        footsteps.command_at(script, 1e9),
+        *itertools.islice(footsteps.commands(script, 0.005, 5.0), 226, 1000),
+    ):
+        np.testing.assert_allclose(late.target.ankle_positions, script.steps[-1].end.ankle_positions, atol=1e-15)
+        assert not any(rate.any() for rate in late.rates) and not late.timer.any()
+    assert len(list(footsteps.commands(script, 0.005, 0.1))) == 20
+    assert len(list(footsteps.commands(script, 0.005, 5.0))) == 1000
+
+
+# What is wrong, the line it stands on, and words that must name it and what would be right. Line 1 is the header.
+WRONG = {
+    "unknown foot": ("lfet,0.1", 2, "foot is 'lfet'; wanted left, right or both"),
+    "no foot": (",0.1", 2, "foot is ''; wanted left, right or both"),
+    "not a number": ("left,0,1.2.3", 2, "y is '1.2.3'; wanted a finite number of m"),
+    "not a number of radians": ("left,0,0.1,0,ten", 2, "yaw is 'ten'; wanted a finite number of rad"),
+    "not finite": ("left,nan", 2, "x is 'nan'; wanted a finite number of m"),
+    "infinite": ("left,,,,,inf", 2, "period is 'inf'; wanted a finite number of s"),
+    "too large": ("left,1e300", 2, "x is '1e300'; wanted a finite number of m, at most 1000000 m"),
+    "no period": ("left\nleft,,,,,0", 3, "period is 0 s; wanted at least 0.005 s"),
+    "negative period": ("left,,,,,-0.5", 2, "period is -0.5 s; wanted at least 0.005 s"),
+    "negative lift": ("left,,,,,,-0.1", 2, "lift is -0.1 m; wanted at least 0 m"),
+    "a cell too many": ("left,,,,,,,,,,,,,0", 2, "has 14 cells; wanted at most 13"),
+    "both with a foothold": ("both,0.2", 2, "x is '0.2', but no foot moves; wanted it empty"),
+    "both with a lift": ("both,,,,,,0.1", 2, "lift is '0.1', but no foot moves; wanted it empty"),
+    "no step": ("# nothing", 1, "no step follows the header; wanted a line for each step"),
+    "box without a number": ("left\n# box 1 2 3 0 1 1", 3, "6 numbers; wanted `# box x y z yaw length width height`"),
+    "box of words": ("left\n# box 1 2 3 0 1 wide 1", 3, "box width is 'wide'; wanted a finite number of m"),
+    "box without a size": ("left\n# box 1 2 3 0 1 0 1", 3, "box width is 0 m; wanted at least 0.001 m"),
+    "box of negative size": ("# box 1 2 3 0 1 1 -1\nleft", 2, "box height is -1 m; wanted at least 0.001 m"),
+    "box around a foot": ("left,0.2\n# box 0 0.1 0 0 0.1 0.1 0.1", 3, "where the left foot starts"),
+    # hip over the middle, at 0.675 m: sqrt(0.4^2 + 0.635^2) m = 0.7505 m to the ankle, allowed are 0.74 m
+    "too far": ("left,0.8", 2, "the left foot is 1.0 cm out of reach at the end of the step, its ankle 0.750 m"),
+    "trunk too far": ("both,,,,,1,,,,0.9", 2, "the right foot is 4.5 cm out of reach at the end of the step"),
+    "swung too high": ("left,,,,,0.4,0.4", 2, "the left foot is 11.5 cm out of reach 0.20 s into the step"),
+    "turned too far": ("left,,,,0.9,,,,,,,,0", 2, "turned 6.6 deg too far at the end of the step; wanted -45.0 deg"),
+    "on the other foot": ("left,0.1,-0.08", 2, "overlaps the right foot by 6.0 cm"),
+    "in the air": ("left,0.1,0.1,0.05", 2, "its sole's 4 corners the ground is up to 5.0 cm below z = 0.05 m"),
+    "under the ground": ("left,0.1,0.1,-0.05", 2, "5.0 cm under the ground; wanted z = 0 m"),
+    "inside a box": ("# box 0.3 0.1 0 0 0.4 0.2 0.1\nleft,0.2,0.1,0", 3, "box of line 2; wanted it on top, z = 0.1 m"),
+    "heel over an edge": ("# box 0.3 0 0 0 0.2 0.4 0.1\nleft,0.25", 3, "in the air: under 2 of its sole's 4 corners"),
+    "heel over an edge under a roof": (
+        "# box 0.3 0 0 0 0.2 0.4 0.1\n# box 0 0 1 0 2 2 0.1\nleft,0.25,,0.1", 4, "in the air: under 2 of its sole"
+    ),
+    "toes in a riser": ("# box 0.3 0 0 0 0.2 0.4 0.1\nleft,0.15", 3, "inside the box of line 2"),
+    "a pole under the sole": ("# box 0.2 0.1 0 0 0.02 0.02 0.1\nleft,0.2,0.1,0", 3, "inside the box of line 2"),
+    "under a low roof": ("# box 0.3 0.1 0.02 0 0.4 0.1 0.1\nleft,0.3,0.1,0", 3, "inside the box of line 2"),
+    "over the edge when turned": ("# box 0.2 0.1 0 0 0.16 0.1 0.05\nleft,0.2,0.1,,0.3", 3, "in the air: under 4"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("rows, line, words", WRONG.values(), ids=WRONG.keys())
+def test_what_is_wrong_is_named_with_its_line(rows: str, line: int, words: str) -> None:
+    found = problems(HEADER + rows)
+    assert any(words in p for p in found), found
+    assert all(p.startswith(f"walk.csv:{line}: ") for p in found), found
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        # within a hair of what the list above refuses
+        "left,0.76",
+        "left,,,,,0.4,0.28",
+        "left,,,,0.78,,,,,,,,0",
+        "left,0,0",  # sole beside sole
+        "left,0.1,0.1,0.0009",
+        "both,,,,,1,,,,0.85",
+        "# box 0.2 0.1 0 0 0.16 0.1 0.05\nleft,0.2,0.1",  # every corner on an edge
+        "# box 0.2 0.1 0 0.3 0.16 0.1 0.05\nleft,0.2,0.1,,0.3",
+        "left,0,-0.0009",
+        "# box 0.28 0.1 0 0 0.16 0.1 0.05\nleft,0.12,0.1,0",  # toes at a riser
+        "# box 0.2791 0.1 0 0 0.16 0.1 0.05\nleft,0.12,0.1,0",
+        "# box 0.3 0.1 0.5 0 0.4 0.1 0.1\nleft,0.3,0.1,0",  # under a high roof
+        "# box 0.15 0.1 0 0 0.1 0.2 0.05\n# box 0.25 0.1 0 0 0.1 0.2 0.05\nleft,0.2",  # over a joint of two boxes
+        "# box 0.2 0.1 -0.2 0 0.4 0.1 0.1\nleft,0.2,0.1",  # buried
+        "left,,,,,0.005\nboth\nleft,,,,,,0",
+    ],
+)
+def test_what_is_only_just_right_passes(rows: str) -> None:
+    assert parse(rows).steps
+
+
+def line_numbers(found: list[str]) -> list[int]:
+    return [int(p.split(":")[1]) for p in found]
+
+
+def test_all_problems_are_listed_by_line() -> None:
+    rows = "lfet\nleft,0.1,one\nright,x,,,,-1,-1\nleft,0.1,0.1\nright,0.1,-0.1\nleft,2\nboth\nright,0.2,,0.1\n"
+    assert line_numbers(problems(HEADER + rows)) == [2, 3, 4, 4, 4, 7, 7, 9, 9, 9]
+    # with a box unread the ground is unknown, and nobody says where it is not
+    assert line_numbers(problems(HEADER + rows + "# box 1")) == [2, 3, 4, 4, 4, 10]
+
+
+def test_nothing_is_said_of_places_that_depend_on_an_unread_cell() -> None:
+    on_a_box = "# box 0.4 0.1 0 0 0.4 0.2 0.1\n" + HEADER
+    assert line_numbers(problems(on_a_box + "left,x,0.1,0.1\nright,0.3,-0.1")) == [3]
+    assert line_numbers(problems(HEADER + "lfet,0.3,0.1\nright,0.6,-0.1\nright,0.8,-0.1")) == [2]
+    # but of places that are known again
+    assert line_numbers(problems(HEADER + "left,x\nleft,0.1,0.1,0.05\nright,1,-0.1")) == [2, 3, 4, 4]
+
+
+def test_rectangles_at_an_angle_are_apart_where_only_an_edge_of_one_tells() -> None:
+    square = footsteps.Box(0, 0, 0, 0, 1, 1, 1).corners
+    diamond = footsteps.Box(0.9, 0.9, 0, math.pi / 4, 1, 1, 1).corners
+    apart = 0.9 * math.sqrt(2) - math.sqrt(0.5) - 0.5
+    assert footsteps._overlap(square, diamond) == pytest.approx(-apart)
+    assert footsteps._overlap(diamond, square) == pytest.approx(-apart)
+    assert footsteps._overlap(square, footsteps.Box(0.9, 0, 0, 0.0, 1, 1, 1).corners) == pytest.approx(0.1)
+
+
+def test_a_way_back_into_reach_is_no_problem_of_its_line() -> None:
+    assert line_numbers(problems(HEADER + "left,0.9\nboth,,,,,9\nleft,0.2\nright,0.2")) == [2, 2]
+
+
+def test_of_a_step_out_of_reach_the_end_is_named_even_if_it_was_farther_on_the_way() -> None:
+    found = problems(HEADER + "left,0.3,0.1,0,0,0.5,0.6,0,0,0.85")
+    assert [p for p in found if "left foot is 5.4 cm out of reach at the end of the step" in p], found
+
+
+def test_headers() -> None:
+    start = "walk.csv:1: "
+    lines = problems(HEADER.replace("trunk_z", "trunkz") + "left")
+    assert lines[0] == f"{start}unknown column 'trunkz'; did you mean 'trunk_z'?"
+    assert lines[1] == f"{start}the header lacks trunk_z; wanted {HEADER.strip()}"
+    assert problems(HEADER.replace(",yaw", "") + "left") == [f"{start}the header lacks yaw; wanted {HEADER.strip()}"]
+    assert problems(HEADER.replace("\n", ",lift\n") + "left") == [
+        f"{start}column 'lift' stands in the header 2 times; wanted it once"
+    ]
+    assert problems("left,0.2,0.1\nright,0.2") == [f"{start}is not the header; wanted {HEADER.strip()}"]
+    assert problems("\n \n# a comment\n") == [
+        f"walk.csv: is empty; wanted the header {HEADER.strip()} and a line for each step"
+    ]
+    assert problems("") == problems("\n")
+
+
+def test_files(tmp_path: Path) -> None:
+    path = tmp_path / "walk.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + WALK.encode())
+    assert footsteps.load(path, RANGER).name == str(path)
+    path.write_bytes(WALK.encode() + b"# b\xfcrste\n")
+    with pytest.raises(ScriptError, match=r"walk\.csv:8: byte 0xfc is not UTF-8; save the file as UTF-8$"):
+        footsteps.load(path, RANGER)
+    with pytest.raises(ScriptError, match=r"none\.csv: cannot be read \(No such file or directory\); wanted a CSV file$"):
+        footsteps.load(tmp_path / "none.csv", RANGER)
+    with pytest.raises(ScriptError, match="cannot be read"):
+        footsteps.load(tmp_path, RANGER)
+    path.write_text(HEADER + "lfet")
+    with pytest.raises(ScriptError, match=rf"^{re.escape(str(path))}:2: foot is"):
+        footsteps.load(path, RANGER)
+
+
+NUMBERS = st.one_of(st.just(""), st.floats(-0.6, 0.6).map(str), st.floats().map(str), st.text(max_size=5))
+MILD = st.one_of(st.just(""), st.floats(-0.3, 0.5).map(lambda x: f"{x:.3f}"))
+ROWS = st.one_of(
+    st.tuples(st.sampled_from(["left", "right", "both", "", "x"]), st.lists(NUMBERS, max_size=13)),
+    st.tuples(st.sampled_from(["left", "right"]), st.lists(MILD, max_size=3)),
+).map(lambda row: ",".join((row[0], *row[1])))
+BOXES = st.lists(st.one_of(MILD, NUMBERS), min_size=6, max_size=8).map(lambda words: "# box " + " ".join(words))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.one_of(st.text(), st.lists(st.one_of(ROWS, BOXES), max_size=5).map(lambda rows: HEADER + "\n".join(rows))))
+@example(HEADER + "left,1e6,-1e6,1e6,1e6,1e6,1e6\nboth,,,,,1e6,,1e6,1e6,1e6,1e6,1e6,1e6")
+@example(HEADER + "left,\x00\x85\u2028,\ud800")
+def test_any_text_is_a_script_or_a_script_error(text: str) -> None:
+    with np.errstate(over="raise", divide="raise", invalid="raise"):
+        try:
+            script = footsteps.parse(text, RANGER, "walk.csv")
+        except ScriptError as error:
+            assert all(re.match(r"walk\.csv(:\d+)?: .*[;:?]", line) for line in str(error).split("\n"))
+            return
+        for step in script.steps:
+            command = footsteps.planner.command(step, step.period / 2)
+            assert all(np.isfinite(part).all() for part in (*command.target, *command.rates, command.timer))
+            ankles, yaws = nodes.ankles_in_trunk_frame(command.target)
+            assert kinematics.reachable(RANGER, ankles, yaws, 2e-3)
+
+
+def test_any_bytes_are_a_script_or_a_script_error(tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("fuzz") / "walk.csv"
+
+    @settings(max_examples=50, deadline=None)
+    @given(st.binary())
+    def check(content: bytes) -> None:
+        path.write_bytes(content)
+        with pytest.raises(ScriptError):
+            footsteps.load(path, RANGER)
+
+    check()
+
+
+def test_footsteps_need_neither_jax_nor_mujoco() -> None:
+    code = "import sys; sys.modules.update(jax=None, mujoco=None, brax=None, flax=None); import bipedtrack.footsteps"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
