@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import brax.envs
 import jax
@@ -48,15 +49,16 @@ class Physics(NamedTuple):
     qpos: Array  # (19,)
     qvel: Array  # (18,)
     warmstart: Array  # (18,) qacc from which the solver starts
-    boxes: Array  # (number of boxes, 3) centres, m
+    boxes: Array  # (number of boxes, 7) position m and quaternion
+    sensors: Array  # what the model's sensors read in the last step; none in training
 
 
 class Episode(NamedTuple):
     """What one robot's episode remembers beside its physics."""
 
     key: Array  # random key of what comes next
-    given: tasks.Distribution
-    task: tasks.Task
+    given: Any  # what the source draws from: tasks.Distribution or plans.Plan
+    task: Any  # what the source remembers of the episode
     step: planner.TaskStep
     index: Array  # () number of the task step
     tick: Array  # () control steps into it
@@ -64,19 +66,48 @@ class Episode(NamedTuple):
     feedback: Array  # (12,) a_fb(t-1)
 
 
+class Answer(NamedTuple):
+    """What one control step did besides moving the robot on."""
+
+    joint_targets: Array  # (12,) rad
+    qacc: Array  # (18,) accelerations
+
+
+def standing(the_robot: robot.Robot, settings: control.ControlConfig, start: nodes.Nodes) -> tuple[Array, Array]:
+    """A robot, qpos (19,), with its nodes at `start` by inverse kinematics and its soles level, and its a_ff (12,)."""
+    a_ff = control.feedforward(the_robot, dataclasses.replace(settings, level_feet=True), start)
+    joints = control.denormalize(the_robot, jnp.clip(a_ff, -1.0, 1.0))
+    return jnp.concatenate([start.trunk_position, start.trunk_orientation, joints]), a_ff
+
+
 class TrackingEnv(brax.envs.Env):
     """One robot that is told, at every instant, where its nodes should be."""
 
-    def __init__(self, the_robot: robot.Robot, config: EnvConfig, given: tasks.Distribution):
-        """Raises ValueError where the policy period is no multiple of the control period."""
+    def __init__(
+        self,
+        the_robot: robot.Robot,
+        config: EnvConfig,
+        given: Any,
+        source: tasks.Source = tasks.RANDOM,
+        boxes: Sequence[Sequence[float]] | None = None,
+        touch: bool = False,
+    ):
+        """An environment whose episodes come from `source` with the data `given`.
+
+        boxes: (length, width, height) of each box that the source poses, m; by default those of stairs, or none.
+        touch: with sensors for the force on each sole.
+        Raises ValueError where the policy period is no multiple of the control period.
+        """
         self.robot = the_robot
         self.config = config
         self.given = given
+        self.source = source
         self.substeps = round(config.policy_period / the_robot.timestep)
         if self.substeps < 1 or not math.isclose(self.substeps * the_robot.timestep, config.policy_period, rel_tol=1e-6):
             raise ValueError(f"policy_period {config.policy_period} s is no multiple of {the_robot.timestep} s")
-        boxes = [terrain.STAIR_BOX] * terrain.STAIR_BOXES if config.stairs else []
-        self.mj_model = robot.build_model(the_robot.name, boxes)
+        if boxes is None:
+            boxes = [terrain.STAIR_BOX] * terrain.STAIR_BOXES if config.stairs else []
+        self.mj_model = robot.build_model(the_robot.name, boxes, touch=touch)
         self.mjx_model = mjx.put_model(self.mj_model)
         self._blank = mjx.make_data(self.mj_model)
 
@@ -99,19 +130,19 @@ class TrackingEnv(brax.envs.Env):
         """A new episode: task, task step and robot, standing where the first command wants it."""
         return self.begin(rng, self.given)
 
-    def begin(self, key: Array, given: tasks.Distribution) -> brax.envs.State:
+    def begin(self, key: Array, given: Any) -> brax.envs.State:
         """A new episode drawn from `given`. No forward dynamics: joint angles come from inverse kinematics."""
         key, key_task, key_step = jax.random.split(key, 3)
-        task, start = tasks.begin(key_task, given, self.robot.ankle_height)
+        task, start = self.source.begin(key_task, given, self.robot.ankle_height)
         index = jnp.int32(0)
         step = self._task_step(key_step, given, task, index, start)
-        a_ff = control.feedforward(self.robot, dataclasses.replace(self.config.control, level_feet=True), start)
-        joints = control.denormalize(self.robot, jnp.clip(a_ff, -1.0, 1.0))
+        qpos, a_ff = standing(self.robot, self.config.control, start)
         physics = Physics(
-            qpos=jnp.concatenate([start.trunk_position, start.trunk_orientation, joints]),
+            qpos=qpos,
             qvel=jnp.zeros(self.mj_model.nv),
             warmstart=jnp.zeros(self.mj_model.nv),
-            boxes=self._boxes(task, index),
+            boxes=self._boxes(given, task, index),
+            sensors=jnp.zeros(self.mj_model.nsensordata),
         )
         episode = Episode(
             key=key,
@@ -133,7 +164,7 @@ class TrackingEnv(brax.envs.Env):
         ]
         return brax.envs.State(
             pipeline_state=physics,
-            obs=self._observe(physics, episode, self._command(episode)),
+            obs=self.observe(physics, episode, self.command(episode)),
             reward=zero,
             done=zero,
             metrics=dict.fromkeys([*names, "fell", "nonfinite"], zero),
@@ -144,12 +175,12 @@ class TrackingEnv(brax.envs.Env):
         """One policy step: the feedback is held while planner, feedforward, filter and PD run at 200 Hz."""
         before, episode = state.pipeline_state, state.info["episode"]
         a_fb = jnp.clip(self.config.control.feedback_scale * action, -1.0, 1.0)
-        advance = lambda carry, _: self._control_step(carry[0], carry[1], a_fb)  # noqa: E731
-        (physics, episode), qacc = jax.lax.scan(advance, (before, episode), length=self.substeps)
+        advance = lambda carry, _: self.control_step(carry[0], carry[1], a_fb)  # noqa: E731
+        (physics, episode), answer = jax.lax.scan(advance, (before, episode), length=self.substeps)
 
         finite = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
         physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
-        command = self._command(episode)
+        command = self.command(episode)
         errors = nodes.difference(command.target, kinematics.measure(self.robot, physics.qpos))
         terms = rewards.terms(
             self.config.rewards.sharpness,
@@ -158,13 +189,13 @@ class TrackingEnv(brax.envs.Env):
             a_fb,
             episode.feedback,
             physics.qvel[6:],
-            jnp.where(finite, qacc[-1, 6:], 0.0),
+            jnp.where(finite, answer.qacc[-1, 6:], 0.0),
         )
         episode = episode._replace(feedback=a_fb)
-        fell = self._fell(physics, errors)
+        fell = self.fell(physics, errors)
         return state.replace(
             pipeline_state=physics,
-            obs=self._observe(physics, episode, command),
+            obs=self.observe(physics, episode, command),
             reward=rewards.total(self.config.rewards.weights, terms),
             done=(fell | ~finite).astype(jnp.float32),
             metrics={
@@ -176,13 +207,14 @@ class TrackingEnv(brax.envs.Env):
             info={**state.info, "episode": episode},
         )
 
-    def _control_step(self, physics: Physics, episode: Episode, a_fb: Array) -> tuple[tuple[Physics, Episode], Array]:
-        """One control step of 0.005 s: eqs (4)-(7), physics, clock. Also returns the joint accelerations, (18,)."""
-        a_ff = control.feedforward(self.robot, self.config.control, self._command(episode).target)
+    def control_step(self, physics: Physics, episode: Episode, a_fb: Array) -> tuple[tuple[Physics, Episode], Answer]:
+        """One control step of 0.005 s with a feedback (12,): eqs (4)-(7), physics, clock."""
+        a_ff = control.feedforward(self.robot, self.config.control, self.command(episode).target)
         targets, memory = control.joint_targets(self.robot, self.config.control, episode.control, a_ff, a_fb)
         physics = self._simulate(physics, targets)
         episode = self._tick(episode._replace(control=memory))
-        return (physics._replace(boxes=self._boxes(episode.task, episode.index)), episode), physics.warmstart
+        boxes = self._boxes(episode.given, episode.task, episode.index)
+        return (physics._replace(boxes=boxes), episode), Answer(targets, physics.warmstart)
 
     def _simulate(self, physics: Physics, joint_targets: Array) -> Physics:
         """MJX from t to t + 0.005 s with the PD controllers at the given joint targets, (12,) rad."""
@@ -190,9 +222,9 @@ class TrackingEnv(brax.envs.Env):
             qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=joint_targets
         )
         if self.mj_model.nmocap:
-            data = data.replace(mocap_pos=physics.boxes)
+            data = data.replace(mocap_pos=physics.boxes[:, :3], mocap_quat=physics.boxes[:, 3:])
         data = mjx.step(self.mjx_model, data)
-        return physics._replace(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc)
+        return physics._replace(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc, sensors=data.sensordata)
 
     def _tick(self, episode: Episode) -> Episode:
         """The clock one control step on, into the next task step where this one is over."""
@@ -209,26 +241,25 @@ class TrackingEnv(brax.envs.Env):
             tick=choose(jnp.int32(0), tick),
         )
 
-    def _task_step(
-        self, key: Array, given: tasks.Distribution, task: tasks.Task, index: Array, start: nodes.Nodes
-    ) -> planner.TaskStep:
-        return tasks.next_step(key, given, task, index, start, self.robot.ankle_height, self.robot.timestep)
+    def _task_step(self, key: Array, given: Any, task: Any, index: Array, start: nodes.Nodes) -> planner.TaskStep:
+        return self.source.next_step(key, given, task, index, start, self.robot.ankle_height, self.robot.timestep)
 
-    def _command(self, episode: Episode) -> planner.Command:
+    def command(self, episode: Episode) -> planner.Command:
+        """The command at this instant."""
         return planner.command(episode.step, episode.tick * self.robot.timestep)
 
-    def _boxes(self, task: tasks.Task, index: Array) -> Array:
-        if not self.config.stairs:
-            return jnp.zeros((0, 3))
-        return terrain.stair_boxes(task.stairs, tasks.stance_level(task, index))
+    def _boxes(self, given: Any, task: Any, index: Array) -> Array:
+        if not self.mj_model.nmocap:
+            return jnp.zeros((0, 7))
+        return self.source.boxes(given, task, index)
 
-    def _observe(self, physics: Physics, episode: Episode, command: planner.Command) -> Array:
+    def observe(self, physics: Physics, episode: Episode, command: planner.Command) -> Array:
         """The flat observation of eq (8), (101,)."""
         a_ff = control.feedforward(self.robot, self.config.control, command.target)
         real = kinematics.measure(self.robot, physics.qpos)
         return observation.flatten(observation.observe(command, real, physics.qpos, physics.qvel, a_ff, episode.feedback))
 
-    def _fell(self, physics: Physics, errors: nodes.NodeErrors) -> Array:
+    def fell(self, physics: Physics, errors: nodes.NodeErrors) -> Array:
         """() bool: tilt beyond the limit (the paper's rule), trunk far below its target, or an ankle lost."""
         up = rotations.to_matrix(physics.qpos[3:7])[2]
         tilted = up[2] < math.cos(math.radians(self.config.fall_tilt_deg))

@@ -196,6 +196,11 @@ class Controller:
         """The controller of a policy file; raises as `load` does."""
         return cls(load(path, robot))
 
+    @property
+    def last_feedback(self) -> np.ndarray:
+        """a_fb (12,) of the last step, in [-1, 1]."""
+        return self._feedback
+
     def reset(self, qpos: Array) -> None:
         """Begins anew with a robot that stands at qpos (19,): trunk position, quaternion, joint angles."""
         joints = np.asarray(qpos, np.float32)[7:]

@@ -134,13 +134,14 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
     )
 
 
-def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: bool = False) -> Any:
+def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: bool = False, touch: bool = False) -> Any:
     """The compiled MuJoCo model of a robot with movable boxes for stairs and obstacles.
 
     Args:
       name: the robot.
       boxes: (length, width, height) of each box, m; box i is the mocap body i, parked far below the ground.
       converged: solve every contact problem to convergence instead of the few iterations of the MJCF.
+      touch: add a sensor for the normal force, N, on each foot, left first.
     """
     import mujoco
 
@@ -156,6 +157,16 @@ def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: boo
             friction=[1, 0.005, 0.0001],
             rgba=[0.62, 0.60, 0.56, 1],
         )
+    if touch:
+        for leg in LEGS:
+            zone = f"{leg}_foot_zone"
+            spec.body(f"{leg}_foot").add_site(name=zone, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.2, 0, 0], group=5)
+            spec.add_sensor(
+                name=f"{leg}_touch",
+                type=mujoco.mjtSensor.mjSENS_TOUCH,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname=zone,
+            )
     if converged:
         spec.option.iterations, spec.option.ls_iterations = 100, 50
     return spec.compile()

@@ -7,31 +7,21 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from bipedtrack import footsteps, kinematics, nodes, policy, robot
+from bipedtrack import footsteps, kinematics, nodes, policy, robot, trace
 from bipedtrack.messages import fail
-
-
-class Trace(NamedTuple):
-    """What happened, an entry a control step; the errors compare command and robot at the same instant."""
-
-    time: np.ndarray  # (n,) s
-    qpos: np.ndarray  # (n, 19)
-    ankle_error: np.ndarray  # (n, 2) m, left and right
-    yaw_error: np.ndarray  # (n, 2) rad
-    trunk_error: np.ndarray  # (n,) m
-    fell: bool  # tilted by more than 60 deg or not finite, where the trace then ends
+from bipedtrack.rewards import stationary
 
 
 def model_and_data(script: footsteps.Script, name: str = "ranger_max") -> tuple[Any, Any]:
     """MuJoCo's model and data of a robot at the script's start, with the script's boxes in place."""
     import mujoco
 
-    model = robot.build_model(name, [box.size for box in script.boxes])
+    model = robot.build_model(name, [box.size for box in script.boxes], touch=True)
     # C resets itself silently on a state that is not finite; a fall must stay a fall
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     data = mujoco.MjData(model)
@@ -42,29 +32,38 @@ def model_and_data(script: footsteps.Script, name: str = "ranger_max") -> tuple[
     return model, data
 
 
-def run(controller: policy.Controller, script: footsteps.Script, seconds: float | None = None) -> Trace:
-    """Walks the script, and holds its end until `seconds` are over if they are given."""
+def record(controller: policy.Controller, script: footsteps.Script, seconds: float | None = None) -> trace.Trace:
+    """Walks the script, holds its end until `seconds` are over if they are given, and records every control step.
+
+    The trace has no axis of robots. It ends with a fall: a trunk tilted by more than 60 deg or a state that is not finite.
+    """
     import mujoco
 
     model, data = model_and_data(script)
     controller.reset(data.qpos)
-    rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, float]] = []
-    fell = False
+    rows: list[list[Any]] = []
     for command in footsteps.commands(script, model.opt.timestep, seconds):
-        errors = nodes.difference(command.target, kinematics.measure(controller.policy.robot, data.qpos))
-        ankles, trunk = np.linalg.norm(errors.ankle_positions, axis=-1), float(np.linalg.norm(errors.trunk_position))
-        rows.append((data.time, data.qpos.copy(), ankles, np.abs(errors.ankle_yaws), trunk))
-        data.ctrl[:] = controller.step(data.qpos, data.qvel, command)
+        state = [data.time, data.qpos.copy(), data.qvel.copy()]
+        measured = kinematics.measure(controller.policy.robot, state[1])
+        upright = 1 - 2 * (data.qpos[4] ** 2 + data.qpos[5] ** 2)
+        alive = bool(upright > 0.5)  # cos 60 deg; false for nan
+        targets = controller.step(data.qpos, data.qvel, command)
+        data.ctrl[:] = targets
         mujoco.mj_step(model, data)
-        upright = data.qpos[3] ** 2 - data.qpos[4] ** 2 - data.qpos[5] ** 2 + data.qpos[6] ** 2
-        if not upright > 0.5:  # cos 60 deg; false for nan
-            fell = True
+        answer = [controller.last_feedback, targets, data.actuator_force.copy(), data.sensordata.copy()]
+        rows.append([*state, command.target, measured, command.timer, stationary(command.rates), *answer, alive])
+        if not alive:
             break
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Trace(columns[0], columns[1], columns[2], columns[3], columns[4], fell)
+    return trace.Trace(*(_stack(column) for column in zip(*rows, strict=True)))
 
 
-def picture(trace: Trace, script: footsteps.Script, path: pathlib.Path, frames: int = 6, height: int = 360) -> None:
+def _stack(column: tuple[Any, ...]) -> Any:
+    if isinstance(column[0], nodes.Nodes):
+        return nodes.Nodes(*(np.array(part) for part in zip(*column, strict=True)))
+    return np.array(column)
+
+
+def picture(recorded: trace.Trace, script: footsteps.Script, path: pathlib.Path, frames: int = 6, height: int = 360) -> None:
     """Writes a strip of `frames` evenly spaced pictures of a trace as PNG. Raises RuntimeError without OpenGL."""
     import mujoco
     from PIL import Image
@@ -77,8 +76,8 @@ def picture(trace: Trace, script: footsteps.Script, path: pathlib.Path, frames: 
     options.geomgroup[3] = 0  # shapes that only collide
     pictures = []
     with mujoco.Renderer(model, height, width) as renderer:
-        for i in np.linspace(0, len(trace.time) - 1, frames).astype(int):
-            data.qpos[:] = trace.qpos[i]
+        for i in np.linspace(0, len(recorded.time) - 1, frames).astype(int):
+            data.qpos[:] = recorded.qpos[i]
             mujoco.mj_forward(model, data)
             camera.lookat[:] = [data.qpos[0], data.qpos[1], data.qpos[2] - 0.24]
             renderer.update_scene(data, camera, options)
@@ -86,13 +85,18 @@ def picture(trace: Trace, script: footsteps.Script, path: pathlib.Path, frames: 
     Image.fromarray(np.concatenate(pictures, axis=1)).save(path)
 
 
-def summary(trace: Trace, skip: float = 0.0) -> str:
-    """One line: how long, whether it fell, and the mean errors after the first `skip` seconds."""
-    late = trace.time >= min(skip, trace.time[-1])
+def summary(recorded: trace.Trace) -> str:
+    """One line: how long, whether it fell, and the mean errors until then."""
+    errors = [
+        nodes.difference(*(nodes.Nodes(*(part[i] for part in side)) for side in (recorded.target, recorded.measured)))
+        for i in np.flatnonzero(recorded.alive)
+    ]
+    ankles = 100 * np.mean([np.linalg.norm(error.ankle_positions, axis=-1) for error in errors])
+    yaws = np.degrees(np.mean([np.abs(error.ankle_yaws) for error in errors]))
+    trunk = 100 * np.mean([np.linalg.norm(error.trunk_position) for error in errors])
     return (
-        f"{trace.time[-1]:.1f} s, {'fell' if trace.fell else 'no fall'}; mean error: "
-        f"ankles {100 * trace.ankle_error[late].mean():.1f} cm and {np.degrees(trace.yaw_error[late].mean()):.1f} deg, "
-        f"trunk {100 * trace.trunk_error[late].mean():.1f} cm"
+        f"{recorded.time[-1]:.1f} s, {'no fall' if recorded.alive[-1] else 'fell'}; mean error: "
+        f"ankles {ankles:.1f} cm and {yaws:.1f} deg, trunk {trunk:.1f} cm"
     )
 
 
@@ -121,10 +125,10 @@ def main() -> None:
         the_robot = robot.load()
         controller = policy.Controller(policy.load(options.policy, the_robot), options.feedback)
         script = footsteps.load(options.script, the_robot)
-        trace = run(controller, script, options.seconds)
-        print(summary(trace))
+        recorded = record(controller, script, options.seconds)
+        print(summary(recorded))
         if options.picture is not None:
-            picture(trace, script, options.picture)
+            picture(recorded, script, options.picture)
             print(options.picture)
     except (ValueError, RuntimeError, OSError) as error:
         fail(str(error))

@@ -6,7 +6,8 @@ Random numbers are jax's; the namespace is jax.numpy.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -293,9 +294,20 @@ def next_step(
     )
 
 
-def stance_level(task: Task, index: Array) -> Array:
-    """The tread under the stance foot during task step `index`, (): the place of the window of boxes."""
-    return jnp.minimum(index, task.hold_after)
+def stair_window(given: Distribution, task: Task, index: Array) -> Array:
+    """Poses (3, 7) of the boxes around the tread of the stance foot during task step `index`: position m, quaternion."""
+    return terrain.upright(terrain.stair_boxes(task.stairs, jnp.minimum(index, task.hold_after)))
+
+
+class Source(NamedTuple):
+    """Where an environment's task steps come from: three pure functions of whatever data an episode is given."""
+
+    begin: Callable[..., tuple[Any, Nodes]]  # (key, given, ankle height) -> task, first nodes
+    next_step: Callable[..., TaskStep]  # (key, given, task, index, start, ankle height, timestep)
+    boxes: Callable[..., Array]  # (given, task, index) -> (number of boxes, 7) poses
+
+
+RANDOM = Source(begin, next_step, stair_window)
 
 
 def tracking_errors(errors: nodes.NodeErrors) -> dict[str, Array]:

@@ -39,3 +39,10 @@ def stair_boxes(stairs: Stairs, level: Array) -> Array:
     there = (stairs.rise != 0) & (levels >= xp.where(up, 1, 0))
     z = xp.where(there, top - 0.5 * STAIR_BOX[2], PARKED - slots)
     return xp.stack([x, xp.zeros_like(x), z], axis=-1)
+
+
+def upright(centres: Array) -> Array:
+    """Poses (n, 7), position m and quaternion, of boxes that stand at centres (n, 3), m, without a turn."""
+    xp = namespace(centres)
+    turns = xp.asarray([[1.0, 0.0, 0.0, 0.0]] * centres.shape[0], dtype=centres.dtype)
+    return xp.concat([centres, turns], axis=-1)

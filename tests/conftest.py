@@ -1,13 +1,20 @@
 """What many tests share: the robot, its compiled model, the default curriculum. JAX runs on the CPU."""
 
+import functools
 import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
 
 import hypothesis
+import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 import pytest
 
+from bipedtrack import planner, tasks
 from bipedtrack import robot as robots
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.curriculum import load as load_curriculum
@@ -33,3 +40,42 @@ def mj_model() -> mujoco.MjModel:
 def curriculum() -> Curriculum:
     """The default curriculum."""
     return load_curriculum("quick")
+
+
+class Episodes(NamedTuple):
+    """Many episodes of one kind as numpy arrays, with the leading axes (episode, task step, instant)."""
+
+    task: tasks.Task  # (episodes, ...)
+    step: planner.TaskStep  # (episodes, steps, ...)
+    time: np.ndarray  # (episodes, steps, instants) s into the step, from 0 to its period
+    command: planner.Command  # (episodes, steps, instants, ...)
+
+
+@pytest.fixture(scope="session")
+def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episodes]:
+    """Draws 300 episodes of 12 task steps: episodes(kind, difficulty=1.0, hold_after=None)."""
+    count, steps, instants = 300, 12, 21
+
+    def one(key: Any, given: tasks.Distribution) -> tuple:
+        key_begin, key_steps = jax.random.split(key)
+        task, start = tasks.begin(key_begin, given, robot.ankle_height)
+
+        def following(start: Any, indexed_key: Any) -> tuple:
+            index, key = indexed_key
+            step = tasks.next_step(key, given, task, index, start, robot.ankle_height, robot.timestep)
+            times = jnp.linspace(0, 1, instants) * step.period
+            return step.end, (step, times, jax.vmap(planner.command, (None, 0))(step, times))
+
+        return task, *jax.lax.scan(following, start, (jnp.arange(steps), jax.random.split(key_steps, steps)))[1]
+
+    batched = jax.jit(jax.vmap(one, (0, None)))
+
+    @functools.cache
+    def draw(kind: str, difficulty: float = 1.0, hold_after: tuple[int, int] | None = None) -> Episodes:
+        shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
+        hold_share = 0.0 if hold_after is None else 1.0
+        given = tasks.distribution(curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8))
+        keys = jax.random.split(jax.random.key(tasks.KINDS.index(kind)), count)
+        return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
+
+    return draw

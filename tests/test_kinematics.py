@@ -1,6 +1,5 @@
 """Leg kinematics against MuJoCo's, and the workspace projection against brute force."""
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -249,9 +248,11 @@ def test_jax_projects_any_finite_target_as_numpy_does(robot: Robot, compiled: Ca
     ankles, yaws = numbers[..., :3].astype(dtype), numbers[..., 3].astype(dtype)
     found = compiled(ankles, yaws)
     assert_within_the_workspace(robot, *(found[0].reshape(-1, 2, 3), found[1].reshape(-1, 2), found[2]))
-    in_numpy = [project(robot.cast(dtype), a, y) for a, y in zip(ankles[:400], yaws[:400], strict=True)]
-    assert found[0][:400] == pytest.approx(np.stack([a for a, _ in in_numpy]), abs=1e-5)
-    assert found[1][:400] == pytest.approx(np.stack([y for _, y in in_numpy]), abs=1e-6)
+    near = slice(1, None, 7)
+    in_numpy = [project(robot.cast(dtype), *target) for target in zip(ankles[near], yaws[near], strict=True)]
+    tolerance = {np.float32: 1e-4, np.float64: 1e-12}[dtype]
+    assert found[0][near] == pytest.approx(np.stack([a for a, _ in in_numpy]), abs=tolerance)
+    assert found[1][near] == pytest.approx(np.stack([y for _, y in in_numpy]), abs=tolerance)
 
 
 @given(targets(), st.floats(0, 2))

@@ -1,0 +1,217 @@
+"""Traces of many planned episodes at 200 Hz, in MJX and in MuJoCo C, with the same plans and the same controller."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bipedtrack import control, env, kinematics, observation, planner, plans, robot
+from bipedtrack.nodes import Nodes
+from bipedtrack.rewards import stationary
+from bipedtrack.rotations import Array
+from bipedtrack.trace import Trace
+
+Act = Callable[[Array], Array]  # the network's output (12,) for an observation (101,), in jax.numpy
+_CHUNK = 50  # policy steps between two looks at who is still up
+
+
+class _Sample(NamedTuple):
+    """A Trace's entries of one instant, but for those that follow from them."""
+
+    qpos: Array
+    qvel: Array
+    target: Nodes
+    timer: Array
+    still: Array
+    feedback: Array
+    joint_targets: Array
+    foot_forces: Array
+    alive: Array
+
+
+def in_mjx(the_env: env.TrackingEnv, act: Act, batch: plans.Plan, seconds: float) -> Trace:
+    """Episodes of a batch of plans (leading axis e) in MJX; `the_env` needs plans.PLANNED as source and touch sensors."""
+    robots = batch.boxes.shape[0]
+    scale = the_env.config.control.feedback_scale
+    policy_steps = round(seconds / the_env.config.policy_period)
+
+    def policy_step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], _Sample]:
+        state, alive = carry
+        a_fb = jnp.clip(scale * act(state.obs), -1.0, 1.0)
+
+        def control_step(carry: Any, _: None) -> tuple[Any, _Sample]:
+            (physics, episode), alive = carry
+            command = the_env.command(episode)
+            alive = alive & _upright(physics.qpos, physics.qvel)
+            moved, answer = the_env.control_step(physics, episode, a_fb)
+            sample = _Sample(
+                physics.qpos, physics.qvel, command.target, command.timer, stationary(command.rates), a_fb,
+                answer.joint_targets, moved[0].sensors, alive,
+            )  # fmt: skip
+            return (moved, alive), sample
+
+        start = ((state.pipeline_state, state.info["episode"]), alive)
+        ((physics, episode), alive), samples = jax.lax.scan(control_step, start, length=the_env.substeps)
+        episode = episode._replace(feedback=a_fb)
+        obs = the_env.observe(physics, episode, the_env.command(episode))
+        return (state.replace(pipeline_state=physics, obs=obs, info={"episode": episode}), alive), samples
+
+    @jax.jit
+    def advance(carry: tuple[Any, Array]) -> tuple[tuple[Any, Array], _Sample]:
+        one = lambda state, alive: jax.lax.scan(policy_step, (state, alive), length=_CHUNK)  # noqa: E731
+        return jax.vmap(one)(*carry)
+
+    state = jax.jit(jax.vmap(the_env.begin))(jax.random.split(jax.random.PRNGKey(0), robots), batch)
+    carry = (state, jnp.ones(robots, bool))
+    chunks = []
+    for _ in range(-(-policy_steps // _CHUNK)):
+        carry, samples = advance(carry)
+        flat = jax.tree.map(lambda a: np.asarray(a).reshape(robots, -1, *a.shape[3:]), samples)
+        chunks.append(flat)
+    ticks = policy_steps * the_env.substeps
+    samples = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :ticks], *chunks)
+    return _complete(the_env.robot, samples)
+
+
+class _Memory(NamedTuple):
+    """What the controller remembers of one robot."""
+
+    control: control.ControlState
+    feedback: Array
+
+
+class Controls(NamedTuple):
+    """The controller of a policy, for recording in C."""
+
+    robot: robot.Robot
+    settings: control.ControlConfig
+    policy_period: float  # s
+    act: Act
+
+
+def in_mujoco(
+    controls: Controls,
+    batch: plans.Plan,
+    sizes: Sequence[Sequence[float]],
+    seconds: float,
+    converged: bool = False,
+    model_of: Callable[[Any, int], Any] | None = None,
+    before_step: Callable[[int, Sequence[Any], np.ndarray], np.ndarray] | None = None,
+    observed: Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
+) -> Trace:
+    """Episodes of a batch of plans (leading axis e) in MuJoCo C, stepped on all cores.
+
+    The control law is the controller's own functions mapped over the robots; `policy.Controller` runs the same lines.
+
+    Args:
+      controls: robot, control law and network.
+      batch: the plans, with numpy or jax arrays.
+      sizes: of the plans' boxes, m.
+      seconds: how long.
+      converged: solve contacts to convergence.
+      model_of: (model, episode) -> the model of that episode, for changed masses, friction or motors.
+      before_step: (tick, datas, joint targets (e, 12)) -> joint targets, for pushes and delays.
+      observed: (tick, qpos, qvel) -> what the controller is told of them, for noise.
+    """
+    import mujoco
+
+    the_robot, robots = controls.robot, batch.boxes.shape[0]
+    ticks, hold = round(seconds / the_robot.timestep), max(1, round(controls.policy_period / the_robot.timestep))
+    batch = jax.tree.map(np.asarray, batch)
+    model = robot.build_model(the_robot.name, sizes, converged, touch=True)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    models = [model if model_of is None else model_of(copy.copy(model), i) for i in range(robots)]
+    datas = [mujoco.MjData(m) for m in models]
+    numbers = [
+        plans.step_numbers(jax.tree.map(lambda a, i=i: a[i], batch), the_robot.timestep, ticks) for i in range(robots)
+    ]
+    index, within = (np.array(column) for column in zip(*numbers, strict=True))
+
+    @jax.jit
+    @jax.vmap
+    def answer(plan: plans.Plan, number: Array, tick: Array, memory: _Memory, qpos: Array, qvel: Array, think: Array) -> Any:
+        command = planner.command(jax.tree.map(lambda a: a[number], plan.steps), tick * the_robot.timestep)
+        a_ff = control.feedforward(the_robot, controls.settings, command.target)
+        real = kinematics.measure(the_robot, qpos)
+        seen = observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, memory.feedback))
+        fresh = jnp.clip(controls.settings.feedback_scale * controls.act(seen), -1.0, 1.0)
+        a_fb = jnp.where(think, fresh, memory.feedback)
+        targets, state = control.joint_targets(the_robot, controls.settings, memory.control, a_ff, a_fb)
+        return targets, _Memory(state, a_fb), command.target, command.timer, stationary(command.rates)
+
+    start = jax.jit(jax.vmap(lambda plan: _start(the_robot, controls.settings, plan)))
+    qpos, memory = start(batch)
+    for data, first in zip(datas, np.asarray(qpos, np.float64), strict=True):
+        data.qpos[:] = first
+    alive = np.ones(robots, bool)
+    samples = []
+
+    def simulate(members: range) -> None:
+        for i in members:
+            if alive[i]:
+                mujoco.mj_step(models[i], datas[i])
+
+    workers = os.cpu_count() or 1
+    shares = [range(w, robots, workers) for w in range(workers)]
+    with ThreadPoolExecutor(workers) as pool:
+        for tick in range(ticks):
+            for i in np.flatnonzero((index[:, tick] != index[:, tick - 1]) | (tick == 0)):
+                poses = batch.boxes[i, index[i, tick]]
+                datas[i].mocap_pos[:], datas[i].mocap_quat[:] = poses[:, :3], poses[:, 3:]
+            qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
+            alive = alive & np.asarray(_upright(qpos.T, qvel.T))
+            seen = (qpos, qvel) if observed is None else observed(tick, qpos, qvel)
+            told = [np.where(alive[:, None], part, 0.0).astype(np.float32) for part in seen]
+            think = np.full(robots, tick % hold == 0)
+            targets, memory, target, timer, still = answer(batch, index[:, tick], within[:, tick], memory, *told, think)
+            wanted = np.asarray(targets, np.float64)
+            if before_step is not None:
+                wanted = before_step(tick, datas, wanted)
+            for data, ctrl in zip(datas, wanted, strict=True):
+                data.ctrl[:] = ctrl
+            list(pool.map(simulate, shares))
+            forces = np.array([d.sensordata for d in datas])
+            part = (target, timer, still, memory.feedback)
+            target, timer, still, feedback = jax.tree.map(np.asarray, part)
+            samples.append(_Sample(qpos, qvel, target, timer, still, feedback, wanted, forces, alive))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts, axis=1), *samples)
+    return _complete(the_robot, stacked)
+
+
+def _start(the_robot: robot.Robot, settings: control.ControlConfig, plan: plans.Plan) -> tuple[Array, _Memory]:
+    """A robot, qpos (19,), on the plan's first command, soles level, and a controller that asks for that."""
+    qpos, a_ff = env.standing(the_robot, settings, jax.tree.map(lambda a: a[0], plan.steps.start))
+    return qpos, _Memory(control.initial(a_ff), jnp.zeros(len(the_robot.joint_names)))
+
+
+def _upright(qpos: Array, qvel: Array) -> Array:
+    """Whether a robot's state is finite and its trunk tilted by less than 60 deg; leading axes of 19 and 18."""
+    finite = (abs(qpos) < 1e6).all(axis=0) & (abs(qvel) < 1e6).all(axis=0)
+    return finite & (1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2) > 0.5)
+
+
+def _complete(the_robot: robot.Robot, samples: _Sample) -> Trace:
+    """The trace of samples (e, n, ...): with measured nodes, torques and time."""
+    measured = jax.jit(jax.vmap(jax.vmap(lambda qpos: kinematics.measure(the_robot, qpos))))(samples.qpos)
+    wanted = the_robot.kp * (samples.joint_targets - samples.qpos[..., 7:]) - the_robot.kd * samples.qvel[..., 6:]
+    return Trace(
+        time=np.arange(samples.qpos.shape[1]) * the_robot.timestep,
+        qpos=samples.qpos,
+        qvel=samples.qvel,
+        target=samples.target,
+        measured=jax.tree.map(np.asarray, measured),
+        timer=samples.timer,
+        still=samples.still,
+        feedback=samples.feedback,
+        joint_targets=samples.joint_targets,
+        torques=np.clip(wanted, -the_robot.torque_limit, the_robot.torque_limit),
+        foot_forces=samples.foot_forces,
+        alive=samples.alive,
+    )
