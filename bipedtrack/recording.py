@@ -36,11 +36,12 @@ class _Sample(NamedTuple):
     alive: Array
 
 
-def in_mjx(the_env: env.TrackingEnv, act: Act, batch: plans.Plan, seconds: float) -> Trace:
-    """Episodes of a batch of plans (leading axis e) in MJX; `the_env` needs plans.PLANNED as source and touch sensors."""
-    robots = batch.boxes.shape[0]
+def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, float], Trace]:
+    """A function (batch of plans with leading axis e, seconds) -> trace in MJX, which compiles once for all batches.
+
+    `the_env` needs plans.PLANNED as its source, the batches' boxes, and touch sensors.
+    """
     scale = the_env.config.control.feedback_scale
-    policy_steps = round(seconds / the_env.config.policy_period)
 
     def policy_step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], _Sample]:
         state, alive = carry
@@ -68,16 +69,21 @@ def in_mjx(the_env: env.TrackingEnv, act: Act, batch: plans.Plan, seconds: float
         one = lambda state, alive: jax.lax.scan(policy_step, (state, alive), length=_CHUNK)  # noqa: E731
         return jax.vmap(one)(*carry)
 
-    state = jax.jit(jax.vmap(the_env.begin))(jax.random.split(jax.random.PRNGKey(0), robots), batch)
-    carry = (state, jnp.ones(robots, bool))
-    chunks = []
-    for _ in range(-(-policy_steps // _CHUNK)):
-        carry, samples = advance(carry)
-        flat = jax.tree.map(lambda a: np.asarray(a).reshape(robots, -1, *a.shape[3:]), samples)
-        chunks.append(flat)
-    ticks = policy_steps * the_env.substeps
-    samples = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :ticks], *chunks)
-    return _complete(the_env.robot, samples)
+    begin = jax.jit(jax.vmap(the_env.begin))
+
+    def record(batch: plans.Plan, seconds: float) -> Trace:
+        robots, policy_steps = batch.boxes.shape[0], round(seconds / the_env.config.policy_period)
+        state = begin(jax.random.split(jax.random.PRNGKey(0), robots), batch)
+        carry = (state, jnp.ones(robots, bool))
+        chunks = []
+        for _ in range(-(-policy_steps // _CHUNK)):
+            carry, samples = advance(carry)
+            chunks.append(jax.tree.map(lambda a: np.asarray(a).reshape(robots, -1, *a.shape[3:]), samples))
+        ticks = policy_steps * the_env.substeps
+        samples = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :ticks], *chunks)
+        return _complete(the_env.robot, samples)
+
+    return record
 
 
 class _Memory(NamedTuple):
@@ -128,6 +134,8 @@ def in_mujoco(
     model = robot.build_model(the_robot.name, sizes, converged, touch=True)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     models = [model if model_of is None else model_of(copy.copy(model), i) for i in range(robots)]
+    for changed in models if model_of is not None else []:
+        mujoco.mj_setConst(changed, mujoco.MjData(changed))  # what MuJoCo derives from masses
     datas = [mujoco.MjData(m) for m in models]
     numbers = [
         plans.step_numbers(jax.tree.map(lambda a, i=i: a[i], batch), the_robot.timestep, ticks) for i in range(robots)

@@ -86,6 +86,7 @@ class Distribution(NamedTuple):
     shares: Array  # (6,) cumulative, ending at 1
     hold_share: Array  # () share of the episodes that stop and hold
     hold_after: Array  # (2,) least and greatest number of task steps before the hold
+    down_share: Array  # () share of the stairs that go down
     ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
 
 
@@ -103,7 +104,12 @@ class Task(NamedTuple):
 
 
 def distribution(
-    ranges: Ranges, shares: Shares, difficulty: float, hold_share: float, hold_after: tuple[int, int]
+    ranges: Ranges,
+    shares: Shares,
+    difficulty: float,
+    hold_share: float,
+    hold_after: tuple[int, int],
+    down_share: float = 0.5,
 ) -> Distribution:
     """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
     total = jnp.array(shares, jnp.float32)
@@ -116,6 +122,7 @@ def distribution(
         shares=jnp.cumsum(total / total.sum()).at[last:].set(1.0),
         hold_share=jnp.float32(hold_share),
         hold_after=jnp.array(hold_after, jnp.float32),
+        down_share=jnp.float32(down_share),
         ranges=scaled,
     )
 
@@ -170,7 +177,7 @@ def begin(key: Array, given: Distribution, ankle_height: float) -> tuple[Task, N
             jnp.stack([draw["stair_tread"], zero, zero]),
         ]
     )
-    down = u[1] < 0.5
+    down = u[1] < given.down_share
     on_stairs = kind == STAIRS
     rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
     stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))

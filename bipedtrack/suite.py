@@ -1,0 +1,100 @@
+"""The tasks of the evaluation: the same plans for every policy, from fixed seeds and Table II's full ranges.
+
+Random tasks draw from `tasks.Ranges` with the named range narrowed to one direction; stairs go through a fixed grid of
+risers and treads; scripts are the footstep files in `curricula/footsteps/`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bipedtrack import footsteps, paths, plans, robot, tasks, terrain
+
+RISERS = (0.05, 0.08, 0.11, 0.14, 0.17)  # m
+TREADS = (0.25, 0.30, 0.35)  # m
+HOLD_AFTER = (1, 8)  # task steps before a hold
+
+
+class Batch(NamedTuple):
+    """The episodes of one task."""
+
+    plan: plans.Plan  # leading axis: episodes
+    sizes: tuple[tuple[float, float, float], ...]  # of the plan's boxes: length, width, height, m
+    ranges: str  # what the episodes are drawn from, in words
+
+
+@dataclasses.dataclass(frozen=True)
+class _Random:
+    """A task drawn from one kind."""
+
+    kind: str
+    narrowed: dict[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
+    down_share: float = 0.5
+
+
+_RANDOM = {
+    "stand": _Random("stand"),
+    "squat": _Random("squat"),
+    "walk-forward": _Random("walk", {"walk_step": (0.03, 0.03, 0.25)}),
+    "walk-backward": _Random("walk", {"walk_step": (-0.15, -0.03, -0.03)}),
+    "sidle-left": _Random("sidle", {"sidle_step": (0.02, 0.02, 0.12)}),
+    "sidle-right": _Random("sidle", {"sidle_step": (-0.12, -0.02, -0.02)}),
+    "turn-left": _Random("turn", {"turn_yaw": (0.05, 0.05, 0.35)}),
+    "turn-right": _Random("turn", {"turn_yaw": (-0.35, -0.05, -0.05)}),
+    "stairs-up": _Random("stairs", down_share=0.0),
+    "stairs-down": _Random("stairs", down_share=1.0),
+}
+_SCRIPTS = ("obstacles", "composite")
+MOVING = tuple(name for name in _RANDOM if name != "stand")
+TASKS = (*_RANDOM, *(f"hold-{name}" for name in MOVING), *_SCRIPTS)
+
+
+def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int, seconds: float, seed: int) -> Batch:
+    """The episodes of a task of TASKS.
+
+    Args:
+      name: of TASKS.
+      ranges: Table II's, as the curriculum has them.
+      the_robot: whose control period and ankle height the plans need.
+      episodes: how many; a script is the same every time.
+      seconds: how long they last.
+      seed: with the task's name, decides the episodes.
+    """
+    if name in _SCRIPTS:
+        return script_batch(footsteps.load(paths.data_dir("curricula") / "footsteps" / f"{name}.csv", the_robot), episodes)
+    hold = name.startswith("hold-")
+    what = _RANDOM[name.removeprefix("hold-")]
+    steps = int(np.ceil(seconds / ranges.period[0])) + 1
+    key = jax.random.fold_in(jax.random.PRNGKey(seed), TASKS.index(name))
+    given = [_distribution(ranges, what, hold, i) for i in range(episodes)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
+    lay_out = jax.jit(jax.vmap(lambda key, one: plans.random_plan(key, one, the_robot, steps)))
+    plan = jax.tree.map(np.asarray, lay_out(jax.random.split(key, episodes), stacked))
+    narrowed = ", ".join(f"{k} {list(v)}" for k, v in what.narrowed.items()) or "full ranges"
+    if what.kind == "stairs":
+        narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
+    words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
+    return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words)
+
+
+def script_batch(script: footsteps.Script, episodes: int = 1) -> Batch:
+    """A footstep script as a task, `episodes` times the same."""
+    one = plans.script_plan(script)
+    repeated = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], episodes, axis=0), one)
+    return Batch(repeated, tuple(box.size for box in script.boxes), f"footstep script {pathlib.Path(script.name).name}")
+
+
+def _distribution(ranges: tasks.Ranges, what: _Random, hold: bool, episode: int) -> tasks.Distribution:
+    """What episode number `episode` is drawn from: stairs go through the grid, all else is the same for every one."""
+    narrowed = dict(what.narrowed)
+    if what.kind == "stairs":
+        riser, tread = RISERS[episode % len(RISERS)], TREADS[episode // len(RISERS) % len(TREADS)]
+        narrowed |= {"stair_riser": (riser,) * 3, "stair_tread": (tread,) * 3}
+    shares = tasks.Shares(**{kind: float(kind == what.kind) for kind in tasks.KINDS})
+    return tasks.distribution(ranges._replace(**narrowed), shares, 1.0, float(hold), HOLD_AFTER, down_share=what.down_share)
