@@ -212,6 +212,11 @@ def write_json(path: str | Path, content: Any) -> None:
     _write_atomically(Path(path), (_strict_json(content, indent=2) + "\n").encode())
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a text file in UTF-8, atomically. Raises RunError when it cannot be written."""
+    _write_atomically(Path(path), text.encode())
+
+
 def append_jsonl(path: str | Path, record: Any) -> None:
     """Appends `record` as one line of JSON in one write; a last line that was cut off is dropped first.
 

@@ -100,6 +100,7 @@ class Controls(NamedTuple):
     settings: control.ControlConfig
     policy_period: float  # s
     act: Act
+    feedforward: bool = True  # False: it stays at the first command's
 
 
 def in_mujoco(
@@ -146,7 +147,8 @@ def in_mujoco(
     @jax.vmap
     def answer(plan: plans.Plan, number: Array, tick: Array, memory: _Memory, qpos: Array, qvel: Array, think: Array) -> Any:
         command = planner.command(jax.tree.map(lambda a: a[number], plan.steps), tick * the_robot.timestep)
-        a_ff = control.feedforward(the_robot, controls.settings, command.target)
+        wanted = command.target if controls.feedforward else jax.tree.map(lambda a: a[0], plan.steps.start)
+        a_ff = control.feedforward(the_robot, controls.settings, wanted)
         real = kinematics.measure(the_robot, qpos)
         seen = observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, memory.feedback))
         fresh = jnp.clip(controls.settings.feedback_scale * controls.act(seen), -1.0, 1.0)

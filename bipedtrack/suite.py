@@ -50,9 +50,9 @@ _RANDOM = {
     "stairs-up": _Random("stairs", down_share=0.0),
     "stairs-down": _Random("stairs", down_share=1.0),
 }
-_SCRIPTS = ("obstacles", "composite")
+SCRIPTS = ("obstacles", "composite")
 MOVING = tuple(name for name in _RANDOM if name != "stand")
-TASKS = (*_RANDOM, *(f"hold-{name}" for name in MOVING), *_SCRIPTS)
+TASKS = (*_RANDOM, *(f"hold-{name}" for name in MOVING), *SCRIPTS)
 
 
 def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int, seconds: float, seed: int) -> Batch:
@@ -66,8 +66,8 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
       seconds: how long they last.
       seed: with the task's name, decides the episodes.
     """
-    if name in _SCRIPTS:
-        return script_batch(footsteps.load(paths.data_dir("curricula") / "footsteps" / f"{name}.csv", the_robot), episodes)
+    if name in SCRIPTS:
+        return script_batch(footsteps.load(script_path(name), the_robot), episodes)
     hold = name.startswith("hold-")
     what = _RANDOM[name.removeprefix("hold-")]
     steps = int(np.ceil(seconds / ranges.period[0])) + 1
@@ -81,6 +81,11 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
         narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
     return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words)
+
+
+def script_path(name: str) -> pathlib.Path:
+    """The file of a script that ships."""
+    return paths.data_dir("curricula") / "footsteps" / f"{name}.csv"
 
 
 def script_batch(script: footsteps.Script, episodes: int = 1) -> Batch:

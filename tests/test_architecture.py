@@ -1,0 +1,99 @@
+"""Imports inside the package point one way, and what runs a policy needs neither JAX nor MuJoCo."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import bipedtrack
+
+FOLDER = Path(bipedtrack.__file__).parent
+MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
+
+# A module may import those before it: on a line above, or further left on its own.
+LADDER = """
+    versions paths messages
+    config checkpoint
+    rotations robot
+    nodes kinematics trace
+    planner terrain
+    tasks footsteps plans disturbances control observation rewards metrics
+    policy onnx_export env autoreset
+    curriculum rollout progress recording suite
+    training evaluation
+    doctor train export evaluate simulate video __main__
+""".split()
+
+# Between a command and the joint targets: on a robot there is numpy and nothing else.
+DEPLOYMENT = "rotations nodes kinematics planner control observation policy footsteps robot config checkpoint".split()
+ABSENT = ("jax", "flax", "brax", "optax", "mujoco")
+
+
+def imported(source: str) -> set[str]:
+    """The package's own modules that a source imports, at its top or inside a function."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            origin = f"bipedtrack.{node.module or ''}".rstrip(".") if node.level else node.module
+            names = [f"{origin}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            package, _, rest = name.partition(".")
+            module = rest.partition(".")[0]
+            if package == "bipedtrack" and module in MODULES:
+                found.add(module)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("import bipedtrack.env\nimport numpy", {"env"}),
+        ("from bipedtrack import env, __version__, robot as robots", {"env", "robot"}),
+        ("def f():\n    from bipedtrack.nodes import Nodes", {"nodes"}),
+        ("from . import env\nfrom .nodes import Nodes", {"env", "nodes"}),
+        ("import jax\nfrom brax import envs", set()),
+    ],
+)
+def test_every_form_of_import_is_seen(source: str, expected: set[str]) -> None:
+    assert imported(source) == expected
+
+
+def test_every_module_has_its_place_on_the_ladder() -> None:
+    assert set(MODULES) - {"__init__"} == set(LADDER), "a new module gets the lowest place that its imports allow"
+    assert len(LADDER) == len(set(LADDER))
+
+
+@pytest.mark.parametrize("module", LADDER)
+def test_imports_point_one_way(module: str) -> None:
+    allowed = set(LADDER[: LADDER.index(module)])
+    assert imported(MODULES[module].read_text(encoding="utf-8")) <= allowed
+
+
+def test_the_package_itself_imports_nothing() -> None:
+    tree = ast.parse(MODULES["__init__"].read_text(encoding="utf-8"))
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], cwd=FOLDER.parent, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("modules", [*DEPLOYMENT, " ".join(DEPLOYMENT)])
+def test_deployment_half_imports_without_jax_and_mujoco(modules: str) -> None:
+    block = f"import sys; sys.modules.update(dict.fromkeys({ABSENT}))"
+    imports = "; ".join(f"import bipedtrack.{module}" for module in modules.split())
+    done = run(f"{block}; {imports}; print(sorted(n for n in sys.modules if n.partition('.')[0] in {ABSENT}))")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(sorted(ABSENT))  # the five blocked names, and nothing below them
+
+
+def test_a_module_that_needs_jax_does_not_import_without_it() -> None:
+    done = run("import sys; sys.modules['jax'] = None; import bipedtrack.tasks")
+    assert done.returncode == 1
+    assert "jax" in done.stderr.splitlines()[-1]
