@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import io
 import logging
-import os
 import pathlib
 import signal
 import sys
@@ -60,15 +59,15 @@ class DeviceError(RuntimeError):
 
 def use_device(device: str) -> str:
     """Makes JAX use a device and returns its description. Raises DeviceError where it is missing."""
-    if device != "auto":
-        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
-    logging.getLogger("jax._src.xla_bridge").setLevel(logging.CRITICAL)
     import jax
 
+    logging.getLogger("jax._src.xla_bridge").setLevel(logging.CRITICAL)
+    if device != "auto":
+        jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
     try:
         devices = jax.devices()
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
+    except (RuntimeError, AssertionError) as error:  # an assertion where JAX has no build for the platform at all
+        reason = (str(error) or "no such back end").splitlines()[0]
         raise DeviceError(
             f"--device {device}: JAX finds no such device ({reason}); use --device cpu, or "
             "`pip install bipedtrack[cuda]` on a machine with an NVIDIA GPU"
@@ -80,6 +79,7 @@ def run(options: Train) -> None:
     """Trains, exports and shows the table."""
     if options.seed < 0:
         raise config.ConfigError(f"--seed {options.seed}: must not be negative")
+    device = use_device(options.device)
     folder = options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
     if options.resume:
         directory = checkpoint.RunDirectory.open(folder)
@@ -91,7 +91,6 @@ def run(options: Train) -> None:
         settings = {"curriculum": config.to_dict(plan), "seed": seed, "versions": _versions()}
         directory = checkpoint.RunDirectory.create(folder, settings)
     try:
-        device = use_device(options.device)
         _train(directory, plan, seed, device, options)
     finally:
         directory.close()
