@@ -60,10 +60,12 @@ def denormalize(robot: Robot, action: Array) -> Array:
     return middle + half * action
 
 
-def initial(joints_normalized: Array) -> ControlState:
-    """The state of a controller that has long been asking for these joint angles, (12,) normalised."""
-    xp = namespace(joints_normalized)
-    return ControlState(xp.clip(joints_normalized, -1.0, 1.0), joints_normalized)
+def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
+    """The state of a controller that has long been asking for the joint angles `standing`, (12,) normalised.
+
+    a_ff: the feedforward of the first command, (12,), where it is another; the velocity feedforward begins at zero.
+    """
+    return ControlState(namespace(standing).clip(standing, -1.0, 1.0), standing if a_ff is None else a_ff)
 
 
 def joint_targets(

@@ -10,7 +10,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from bipedtrack import config, paths
+from bipedtrack import checkpoint, config, paths
 from bipedtrack.control import ControlConfig
 from bipedtrack.rewards import RewardConfig
 from bipedtrack.tasks import Ranges, Shares
@@ -173,3 +173,13 @@ def load(name_or_path: str) -> Curriculum:
             known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
             raise config.ConfigError(f"no curriculum named {name_or_path!r} in curricula/; there are: {known}")
     return config.load(Curriculum, path)
+
+
+def of_run(run: checkpoint.RunDirectory) -> tuple[Curriculum, int]:
+    """The curriculum and the seed that a run was started with. Raises RunError or ConfigError where they are damaged."""
+    settings, file = run.settings, run.path / "run.json"
+    if not isinstance(settings, dict) or not isinstance(settings.get("curriculum"), dict):
+        raise checkpoint.RunError(f"{file}: is damaged: it has no curriculum; start a new run")
+    if not isinstance(settings.get("seed"), int):
+        raise checkpoint.RunError(f"{file}: is damaged: it has no seed; start a new run")
+    return config.from_dict(Curriculum, settings["curriculum"], str(file)), settings["seed"]

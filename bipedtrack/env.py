@@ -73,11 +73,14 @@ class Answer(NamedTuple):
     qacc: Array  # (18,) accelerations
 
 
-def standing(the_robot: robot.Robot, settings: control.ControlConfig, start: nodes.Nodes) -> tuple[Array, Array]:
-    """A robot, qpos (19,), with its nodes at `start` by inverse kinematics and its soles level, and its a_ff (12,)."""
-    a_ff = control.feedforward(the_robot, dataclasses.replace(settings, level_feet=True), start)
-    joints = control.denormalize(the_robot, jnp.clip(a_ff, -1.0, 1.0))
-    return jnp.concatenate([start.trunk_position, start.trunk_orientation, joints]), a_ff
+def standing(
+    the_robot: robot.Robot, settings: control.ControlConfig, start: nodes.Nodes
+) -> tuple[Array, control.ControlState]:
+    """A robot, qpos (19,), with its nodes at `start` by inverse kinematics and its soles level, and its controller."""
+    level = control.feedforward(the_robot, dataclasses.replace(settings, level_feet=True), start)
+    joints = control.denormalize(the_robot, jnp.clip(level, -1.0, 1.0))
+    memory = control.initial(level, control.feedforward(the_robot, settings, start))
+    return jnp.concatenate([start.trunk_position, start.trunk_orientation, joints]), memory
 
 
 class TrackingEnv(brax.envs.Env):
@@ -136,7 +139,7 @@ class TrackingEnv(brax.envs.Env):
         task, start = self.source.begin(key_task, given, self.robot.ankle_height)
         index = jnp.int32(0)
         step = self._task_step(key_step, given, task, index, start)
-        qpos, a_ff = standing(self.robot, self.config.control, start)
+        qpos, memory = standing(self.robot, self.config.control, start)
         physics = Physics(
             qpos=qpos,
             qvel=jnp.zeros(self.mj_model.nv),
@@ -151,7 +154,7 @@ class TrackingEnv(brax.envs.Env):
             step=step,
             index=index,
             tick=jnp.int32(0),
-            control=control.initial(a_ff),
+            control=memory,
             feedback=jnp.zeros(self.action_size),
         )
         zero = jnp.float32(0)

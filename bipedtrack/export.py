@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import pathlib
+import sys
 from typing import Annotated
 
 import tyro
@@ -47,16 +48,17 @@ def export(run: pathlib.Path, out: pathlib.Path) -> None:
     Raises checkpoint.RunError or checkpoint.CheckpointError where the run or its checkpoint cannot be read.
     """
     directory = checkpoint.RunDirectory(run)
-    settings = directory.settings
-    plan = config.from_dict(curriculum.Curriculum, settings["curriculum"], str(run / "run.json"))
+    plan, seed = curriculum.of_run(directory)
     found = directory.latest()
+    for warning in directory.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     if found is None:
         raise checkpoint.CheckpointError(f"{run}: has no checkpoint yet; its first PPO call is not finished")
     with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
         from bipedtrack import policy, training
 
     index, arrays, _ = found
-    policy.save(training.to_policy(plan, arrays, training.provenance(plan, settings["seed"], index + 1)), out)
+    policy.save(training.to_policy(plan, arrays, training.provenance(plan, seed, index + 1)), out)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ observation layout), so an exported policy cannot act otherwise than in training
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 from typing import Any, NamedTuple
 
@@ -105,6 +106,10 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
         robot_meta = dict(meta["robot"]) | {k[6:]: v for k, v in arrays.items() if k.startswith("robot/")}
         robot_meta["joint_names"] = tuple(robot_meta["joint_names"])
         layers = sum(name.startswith("actor/") for name in arrays) // 2
+        known = {"normalizer/mean", "normalizer/std", *(f"robot/{name}" for name in ROBOT_SHAPES)}
+        known |= {f"actor/{i}/{part}" for i in range(layers) for part in ("weight", "bias")}
+        if stray := sorted(set(arrays) - known):
+            raise PolicyError(f"holds an array {stray[0]}, which no policy has")
         policy = Policy(
             network=Network(
                 mean=arrays["normalizer/mean"],
@@ -121,37 +126,56 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
         _check(policy)
         if robot is not None:
             _check_robot(policy.robot, robot)
-    except (KeyError, TypeError, config.ConfigError) as error:
-        raise PolicyError(f"{path}: is no complete policy ({type(error).__name__}: {error})") from None
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise PolicyError(f"{path}: is no complete policy ({type(error).__name__}: {error})") from None
     return policy
+
+
+ROBOT_SHAPES = {
+    "hips": (2, 3),
+    "sole": (2,),
+    "leg_length": (2,),
+    **dict.fromkeys(("joint_low", "joint_high", "feedback_ratio", "kp", "kd", "torque_limit"), (12,)),
+}
+"""The arrays of a Robot and their shapes."""
 
 
 def _check(policy: Policy) -> None:
     """Raises PolicyError where shapes, types or values do not fit together."""
-    network, joints = policy.network, len(policy.robot.joint_names)
-    sizes = [observation.SIZE, *(weight.shape[-1] for weight in network.weights)]
-    wanted = {f"actor/{i}/weight": (w.shape, sizes[i : i + 2]) for i, w in enumerate(network.weights)}
-    wanted |= {f"actor/{i}/bias": (b.shape, [sizes[i + 1]]) for i, b in enumerate(network.biases)}
-    wanted |= {
-        "normalizer/mean": (network.mean.shape, sizes[:1]),
-        "normalizer/std": (network.std.shape, sizes[:1]),
+    network, robot = policy.network, policy.robot
+    outputs = [bias.size for bias in network.biases]
+    sizes = [observation.SIZE, *outputs]
+    wanted: dict[str, tuple[np.ndarray, tuple[int, ...]]] = {
+        "normalizer/mean": (network.mean, (observation.SIZE,)),
+        "normalizer/std": (network.std, (observation.SIZE,)),
+        **{f"actor/{i}/weight": (w, (sizes[i], sizes[i + 1])) for i, w in enumerate(network.weights)},
+        **{f"actor/{i}/bias": (b, (sizes[i + 1],)) for i, b in enumerate(network.biases)},
+        **{f"robot/{name}": (getattr(robot, name), shape) for name, shape in ROBOT_SHAPES.items()},
     }
-    joint_arrays = ("joint_low", "joint_high", "feedback_ratio", "kp", "kd", "torque_limit")
-    wanted |= {f"robot/{name}": (getattr(policy.robot, name).shape, [joints]) for name in joint_arrays}
-    for name, (found, right) in wanted.items():
-        if list(found) != list(right):
-            raise PolicyError(f"array {name} has shape {list(found)}; wanted {list(right)}")
-    if not network.weights or sizes[-1] != joints:
-        raise PolicyError(f"the network gives {sizes[-1]} numbers; wanted one for each of {joints} joints")
+    for name, (array, shape) in wanted.items():
+        if array.shape != shape:
+            raise PolicyError(f"array {name} has shape {list(array.shape)}; wanted {list(shape)}")
+        if not np.isfinite(array).all():
+            raise PolicyError(f"array {name} is not finite")
+        if not name.startswith("robot/") and array.dtype != np.float32:
+            raise PolicyError(f"array {name} is {array.dtype}; wanted float32")
+    if sizes[-1] != len(robot.joint_names) or len(robot.joint_names) != 12:
+        raise PolicyError(f"the network gives {sizes[-1]} numbers for {len(robot.joint_names)} joints; wanted 12 and 12")
     if policy.activation not in ACTIVATIONS:
         raise PolicyError(f"activation {policy.activation!r} is unknown; wanted one of {', '.join(ACTIVATIONS)}")
-    for part in (network.mean, network.std, *network.weights, *network.biases):
-        if part.dtype != np.float32 or not np.isfinite(part).all():
-            raise PolicyError("the network must be of finite float32 numbers")
     if not (network.std > 0).all():
         raise PolicyError("the normaliser's standard deviations must be positive")
+    for name in ("thigh", "shank", "ankle_height", "timestep"):
+        value = getattr(robot, name)
+        if not (isinstance(value, float) and 0 < value < math.inf):
+            raise PolicyError(f"the robot's {name} must be a positive number, not {value!r}")
+    if not (robot.joint_low < robot.joint_high).all():
+        raise PolicyError("the robot's joint_low must lie below joint_high")
+    ticks = policy.policy_period / robot.timestep
+    if not (math.isfinite(ticks) and round(ticks) >= 1 and math.isclose(ticks, round(ticks), rel_tol=1e-6)):
+        raise PolicyError(f"policy_period {policy.policy_period} s is no multiple of {robot.timestep} s")
 
 
 def _check_robot(trained: Robot, wanted: Robot) -> None:
@@ -189,7 +213,8 @@ class Controller:
         self._hold = max(1, round(policy.policy_period / policy.robot.timestep))
         self._tick = 0
         self._feedback = np.zeros(len(policy.robot.joint_names), np.float32)
-        self._memory: control.ControlState | None = None
+        self._standing: np.ndarray | None = None  # normalised joint angles at reset
+        self._memory: control.ControlState | None = None  # from the first step on
 
     @classmethod
     def load(cls, path: str | pathlib.Path, robot: Robot | None = None) -> Controller:
@@ -206,7 +231,8 @@ class Controller:
         joints = np.asarray(qpos, np.float32)[7:]
         if joints.shape != self._feedback.shape:
             raise ValueError(f"qpos must have {7 + self._feedback.size} numbers, not {np.size(qpos)}")
-        self._memory = control.initial(control.normalize(self.robot, joints))
+        self._standing = control.normalize(self.robot, joints)
+        self._memory = None
         self._feedback = np.zeros_like(self._feedback)
         self._tick = 0
 
@@ -220,11 +246,19 @@ class Controller:
 
         Raises:
           RuntimeError: before `reset`.
+          ValueError: a state of another size or that is not finite; the controller's memory is then as before.
         """
-        if self._memory is None:
+        if self._standing is None:
             raise RuntimeError("call reset(qpos) before the first step")
+        for name, state, size in (("qpos", qpos, 7 + self._feedback.size), ("qvel", qvel, 6 + self._feedback.size)):
+            if np.shape(state) != (size,):
+                raise ValueError(f"{name} must have shape ({size},), not {np.shape(state)}")
+            if not np.isfinite(state).all():
+                raise ValueError(f"{name} is not finite: {np.asarray(state)}")
         command = _as_float32(command)
         a_ff = control.feedforward(self.robot, self.policy.settings, command.target)
+        if self._memory is None:
+            self._memory = control.initial(self._standing, a_ff)
         if self.uses_feedback and self._tick % self._hold == 0:
             self._feedback = self.policy.feedback(self.observe(qpos, qvel, command, a_ff))
         targets, self._memory = control.joint_targets(self.robot, self.policy.settings, self._memory, a_ff, self._feedback)

@@ -197,8 +197,8 @@ def in_mujoco(
 
 def _start(the_robot: robot.Robot, settings: control.ControlConfig, plan: plans.Plan) -> tuple[Array, _Memory]:
     """A robot, qpos (19,), on the plan's first command, soles level, and a controller that asks for that."""
-    qpos, a_ff = env.standing(the_robot, settings, jax.tree.map(lambda a: a[0], plan.steps.start))
-    return qpos, _Memory(control.initial(a_ff), jnp.zeros(len(the_robot.joint_names)))
+    qpos, memory = env.standing(the_robot, settings, jax.tree.map(lambda a: a[0], plan.steps.start))
+    return qpos, _Memory(memory, jnp.zeros(len(the_robot.joint_names)))
 
 
 def _upright(qpos: Array, qvel: Array) -> Array:

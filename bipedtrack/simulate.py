@@ -1,6 +1,6 @@
 """A footstep script in MuJoCo C: the numpy controller drives the robot of the MJCF, without jax.
 
-python -m bipedtrack.simulate policy.npz walk.csv --picture walk.png
+python -m bipedtrack.simulate policy.npz walk.csv
 """
 
 from __future__ import annotations
@@ -63,28 +63,6 @@ def _stack(column: tuple[Any, ...]) -> Any:
     return np.array(column)
 
 
-def picture(recorded: trace.Trace, script: footsteps.Script, path: pathlib.Path, frames: int = 6, height: int = 360) -> None:
-    """Writes a strip of `frames` evenly spaced pictures of a trace as PNG. Raises RuntimeError without OpenGL."""
-    import mujoco
-    from PIL import Image
-
-    model, data = model_and_data(script)
-    width = round(0.62 * height)
-    camera = mujoco.MjvCamera()
-    camera.distance, camera.azimuth, camera.elevation = 2.1, 128, -14
-    options = mujoco.MjvOption()
-    options.geomgroup[3] = 0  # shapes that only collide
-    pictures = []
-    with mujoco.Renderer(model, height, width) as renderer:
-        for i in np.linspace(0, len(recorded.time) - 1, frames).astype(int):
-            data.qpos[:] = recorded.qpos[i]
-            mujoco.mj_forward(model, data)
-            camera.lookat[:] = [data.qpos[0], data.qpos[1], data.qpos[2] - 0.24]
-            renderer.update_scene(data, camera, options)
-            pictures.append(renderer.render())
-    Image.fromarray(np.concatenate(pictures, axis=1)).save(path)
-
-
 def summary(recorded: trace.Trace) -> str:
     """One line: how long, whether it fell, and the mean errors until then."""
     errors = [
@@ -112,8 +90,6 @@ class Simulate:
     """How long; the script's end is held. Default: as long as the script takes."""
     feedback: bool = True
     """--no-feedback: inverse kinematics alone."""
-    picture: pathlib.Path | None = None
-    """A PNG to write: a strip of pictures (needs OpenGL, for example MUJOCO_GL=egl)."""
 
 
 def main() -> None:
@@ -127,9 +103,6 @@ def main() -> None:
         script = footsteps.load(options.script, the_robot)
         recorded = record(controller, script, options.seconds)
         print(summary(recorded))
-        if options.picture is not None:
-            picture(recorded, script, options.picture)
-            print(options.picture)
     except (ValueError, RuntimeError, OSError) as error:
         fail(str(error))
     # every refusal of ours is a ValueError or RuntimeError: CheckpointError, PolicyError, ScriptError, RobotError

@@ -83,8 +83,7 @@ def run(options: Train) -> None:
     folder = options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
     if options.resume:
         directory = checkpoint.RunDirectory.open(folder)
-        plan = config.from_dict(curriculum.Curriculum, directory.settings["curriculum"], str(folder / "run.json"))
-        seed = int(directory.settings["seed"])
+        plan, seed = curriculum.of_run(directory)
     else:
         plan, seed = curriculum.load(options.curriculum), options.seed
         robot.load(plan.robot)

@@ -1,6 +1,7 @@
 """The observation of eq (8): its layout, its parts built another way, and what it must not depend on."""
 
 import math
+from collections import namedtuple
 
 import jax
 import jax.numpy as jnp
@@ -161,25 +162,24 @@ def test_observation_does_not_depend_on_place_and_heading_in_the_world(
     assert np.exp(1j * there[angles]) == pytest.approx(np.exp(1j * here[angles]), abs=1e-6)
 
 
-def test_hash_changes_with_order_and_width(monkeypatch: pytest.MonkeyPatch) -> None:
-    widths = observation.WIDTHS
+def test_hash_changes_with_names_order_and_widths(monkeypatch: pytest.MonkeyPatch) -> None:
+    widths = observation.WIDTHS._asdict()
     hashes = [observation.layout_hash(), observation.layout_hash()]
     assert hashes[0] == hashes[1]
-    wider = widths._replace(timer=3)
-    exchanged = widths._replace(timer=widths.gravity, gravity=widths.timer)
-    for changed in (wider, exchanged):
-        monkeypatch.setattr(observation, "WIDTHS", changed)
+    names = list(widths)
+    twins = names.index("feedforward"), names.index("last_feedback")  # equally wide
+    exchanged = names.copy()
+    exchanged[twins[0]], exchanged[twins[1]] = exchanged[twins[1]], exchanged[twins[0]]
+    others = [
+        widths | {"timer": 3},
+        widths | {"timer": widths["gravity"], "gravity": widths["timer"]},
+        {name: widths[name] for name in exchanged},
+        {name: widths[name] for name in reversed(names)},
+    ]
+    for other in others:
+        monkeypatch.setattr(observation, "WIDTHS", namedtuple("Widths", other)(**other))
         hashes.append(observation.layout_hash())
-
-    class Reordered:
-        """The same parts with the same widths, the last first."""
-
-        def _asdict(self) -> dict[str, int]:
-            return dict(reversed(widths._asdict().items()))
-
-    monkeypatch.setattr(observation, "WIDTHS", Reordered())
-    hashes.append(observation.layout_hash())
-    assert len(set(hashes[1:])) == 4
+    assert len(set(hashes[1:])) == 5
 
 
 def test_jax_gives_numpys_observation_in_float32(robot: Robot) -> None:

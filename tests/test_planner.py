@@ -189,6 +189,13 @@ def test_lift_counts_from_the_higher_end() -> None:
     assert points[:, :, 0] == pytest.approx(np.array([[0, 0.03, 0.3, 0.57, 0.6]] * 2))
 
 
+def test_without_lift_a_foot_slides_along_the_straight_line() -> None:
+    start, end = np.array([[0.0, 0, 0.04]] * 2), np.array([[0.6, 0.3, 0.34], [0.6, -0.3, -0.26]])
+    points = planner.swing_points(start, end, np.zeros(2), np.array([0.25, 0.5, 0.75]), np.array([0.8, 1, 1.2]))
+    expected = start[:, None] + np.linspace(0, 1, 5)[:, None] * (end - start)[:, None]
+    assert points == pytest.approx(expected)
+
+
 @KINDS
 @given(random=SEEDS, s=st.floats(0, 0.999))
 def test_timer_is_the_time_until_the_swing_foot_lands(trigonometric: float, random: np.random.Generator, s: float) -> None:

@@ -71,9 +71,6 @@ def test_quaternion_of_a_rotation_vector(v: np.ndarray, dtype: Any) -> None:
     q = rotations.from_rotation_vector(v.astype(dtype))
     assert q.dtype == dtype
     assert_same_rotation(q, Rotation.from_rotvec(v), TOLERANCE[dtype])
-    if np.linalg.norm(v) < 0.1:  # a small angle keeps its digits: sin(a/2) is a/2 - a^3/48
-        a = np.linalg.norm(v)
-        assert q[1:] == pytest.approx(v / 2 - v * a * a / 48, rel=1e-6, abs=1e-30)
 
 
 @given(rotation_vectors(longest=3.1), PRECISIONS)
@@ -83,8 +80,17 @@ def test_rotation_vector_of_a_quaternion_of_either_sign(v: np.ndarray, dtype: An
         found = rotations.to_rotation_vector(quaternion)
         assert found.dtype == dtype
         assert found == pytest.approx(v, abs=4 * TOLERANCE[dtype])
-        if np.linalg.norm(v) < 0.1:
-            assert found == pytest.approx(v, rel=1e-6, abs=1e-30)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_small_angles_keep_their_digits(dtype: Any) -> None:
+    precision = 8 * float(np.finfo(dtype).eps)
+    for angle in np.logspace(-12, 0, 500):
+        v = angle * np.array([0.48, -0.6, 0.64])
+        q = rotations.from_rotation_vector(v.astype(dtype))
+        assert q[1:] == pytest.approx(np.sin(angle / 2) * v / angle, rel=precision, abs=0)
+        assert q[0] == pytest.approx(np.cos(angle / 2), rel=precision, abs=0)
+        assert rotations.to_rotation_vector(q) == pytest.approx(v, rel=precision, abs=0)
 
 
 @given(unit_quaternions(), PRECISIONS)
