@@ -5,6 +5,7 @@ Inverse kinematics, mixing, filter and PD are not in the graph: they need the co
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import pathlib
@@ -31,10 +32,11 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
 
     Normaliser, network, feedback scale and clip are inside; `metadata` is attached. Raises OnnxError.
     """
-    onnx = _onnx()
-    from onnx import helper, numpy_helper
+    _require_onnx()
+    from onnx import TensorProto, checker, helper, numpy_helper
 
-    nodes, constants = [], []
+    nodes: list[onnx.NodeProto] = []
+    constants: list[onnx.TensorProto] = []
 
     def constant(name: str, value: Any) -> str:
         constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
@@ -58,7 +60,7 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
     apply("Clip", hidden, constant("low", -1.0), constant("high", 1.0), output="feedback")
 
     def batch(name: str, width: int, doc: str) -> onnx.ValueInfoProto:
-        return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", width], doc)
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", width], doc)
 
     graph = helper.make_graph(
         nodes,
@@ -76,7 +78,7 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
         doc_string="Feedback of a trunk and ankle tracking controller. Metadata are JSON, in SI units.",
     )
     helper.set_model_props(model, metadata(policy))
-    onnx.checker.check_model(model, full_check=True)
+    checker.check_model(model, full_check=True)
     return model
 
 
@@ -115,9 +117,8 @@ def save(policy: Policy, path: str | pathlib.Path) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _onnx() -> Any:
+def _require_onnx() -> None:
     try:
-        import onnx
+        importlib.import_module("onnx")
     except ImportError:
         raise OnnxError("the package onnx is not installed; wanted `pip install 'bipedtrack[onnx]'`") from None
-    return onnx

@@ -28,18 +28,20 @@ def random_policy(robot: Robot, activation: str = "swish", layers: tuple[int, ..
         ),
         biases=tuple(rng.normal(size=n).astype(np.float32) for n in sizes[1:]),
     )
-    settings = ControlConfig(filter=0.35, feedback_scale=0.23, level_feet=True)
+    settings = ControlConfig(filter=0.35, feedback_scale=0.45, level_feet=True)
     return policies.Policy(network, activation, settings, 0.02, robot, {"seed": 3, "steps": np.int64(4)})
 
 
-def observations() -> np.ndarray:
-    """(10000, 101): ordinary ones, larger ones, zeros, and every single component at ±1000."""
+def observations(network: policies.Network) -> np.ndarray:
+    """(10000, 101): ordinary ones, up to ten times as far from the mean, each single component at 100 deviations, and
+    absurd ones, at which all feedback is at its limits."""
     rng = np.random.default_rng(8)
     ordinary = rng.normal(size=(8000, observation.SIZE))
-    large = rng.normal(size=(1796, observation.SIZE)) * 10 ** rng.uniform(0, 3, (1796, 1))
-    single = 1000 * np.concatenate([np.eye(observation.SIZE), -np.eye(observation.SIZE)])
-    uniform = np.array([np.zeros(observation.SIZE), np.full(observation.SIZE, 1e6)])
-    return np.concatenate([ordinary, large, single, uniform]).astype(np.float32)
+    large = rng.normal(size=(1794, observation.SIZE)) * rng.uniform(1, 10, (1794, 1))
+    single = 100 * np.concatenate([np.eye(observation.SIZE), -np.eye(observation.SIZE)])
+    normalized = np.concatenate([ordinary, large, single, np.zeros((1, observation.SIZE))])
+    absurd = np.array([[0.0], [1e6], [-1e6]]) + np.zeros(observation.SIZE)
+    return np.concatenate([network.mean + network.std * normalized, absurd]).astype(np.float32)
 
 
 def run(model: onnx.ModelProto, batch: np.ndarray) -> np.ndarray:
@@ -50,7 +52,8 @@ def run(model: onnx.ModelProto, batch: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("activation", policies.ACTIVATIONS)
 def test_onnxruntime_and_numpy_give_the_same_feedback(robot: Robot, activation: str) -> None:
-    policy, batch = random_policy(robot, activation), observations()
+    policy = random_policy(robot, activation)
+    batch = observations(policy.network)
     feedback = run(onnx_export.to_onnx(policy), batch)
     expected = policy.feedback(batch)
     assert batch.shape == (10_000, observation.SIZE)
@@ -64,7 +67,7 @@ def test_the_batch_is_of_any_size_and_one_layer_is_enough(robot: Robot) -> None:
     policy = random_policy(robot, layers=())
     model = onnx_export.to_onnx(policy)
     for size in (1, 3):
-        batch = observations()[:size]
+        batch = observations(policy.network)[:size]
         np.testing.assert_allclose(run(model, batch), policy.feedback(batch), rtol=0, atol=1e-5)
 
 
@@ -82,7 +85,7 @@ def test_metadata_say_all_that_a_controller_around_the_graph_needs(robot: Robot)
     assert list(found["observation_layout"].items()) == list(observation.WIDTHS._asdict().items())
     assert found["observation_hash"] == observation.layout_hash()
     assert found["policy_period"] == 0.02
-    assert found["filter"] == 0.35 and found["feedback_scale"] == 0.23
+    assert found["filter"] == 0.35 and found["feedback_scale"] == 0.45
     assert found["level_feet"] is True and found["velocity_feedforward"] is False
     assert found["provenance"] == {"seed": 3, "steps": 4}
     # the robot can be had back to the last bit
