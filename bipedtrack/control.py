@@ -84,5 +84,6 @@ def joint_targets(
         half, lag = (
             xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_half_range, robot.kd / (robot.kp * robot.timestep))
         )
-        targets = targets + lag * half * (a_ff - state.feedforward)
+        low, high = (xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_low, robot.joint_high))
+        targets = xp.clip(targets + lag * half * (a_ff - state.feedforward), low, high)
     return targets, ControlState(filtered, a_ff)

@@ -15,7 +15,7 @@ from bipedtrack.nodes import Nodes
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
-_FAR = 1e6  # m: a target beyond is brought here along its line to the hip, so that its square stays finite
+_FAR = 1e3  # m: a target beyond is brought here along its line to the hip, so that its square stays finite
 _BLEND = 0.01  # m: this close to the hip, where "away from it" has no direction, targets bend towards straight down
 
 

@@ -22,7 +22,7 @@ LADDER = """
     tasks footsteps plans disturbances control observation rewards metrics
     policy onnx_export env autoreset
     curriculum rollout progress recording suite
-    training evaluation
+    training evaluation report
     doctor train export evaluate simulate video __main__
 """.split()
 

@@ -127,6 +127,15 @@ def test_velocity_feedforward_adds_the_velocity_over_kp_times_kd(robot: Robot) -
         assert with_it - without == pytest.approx(0.05 * velocity)  # kd/kp is 50 ms at every joint
 
 
+def test_velocity_feedforward_begins_at_zero_wherever_the_robot_stands(robot: Robot) -> None:
+    stands, a_ff = np.linspace(-0.5, 0.5, 12), np.linspace(0.5, -0.5, 12)
+    state = control.initial(stands, a_ff)
+    targets, _ = control.joint_targets(robot, ControlConfig(filter=0.4, velocity_feedforward=True), state, a_ff, ZERO)
+    # the filter starts from where the robot stands
+    assert targets == pytest.approx(control.denormalize(robot, 0.4 * a_ff + 0.6 * stands))
+    assert control.initial(3 * stands).filtered == pytest.approx(np.clip(3 * stands, -1, 1))
+
+
 def test_feedforward_of_standing_is_the_models_keyframe(robot: Robot, mj_model: mujoco.MjModel) -> None:
     a_ff = control.feedforward(robot, ControlConfig(), standing())
     assert control.denormalize(robot, a_ff) == pytest.approx(mj_model.key("stand").ctrl, abs=1e-6)
