@@ -90,8 +90,8 @@ def comparison(config: curriculum.Curriculum, difficulty: float, rows: dict[str,
     table = rich.table.Table(
         title=f"{first.episodes} episodes of {config.episode_seconds:g} s each, difficulty {difficulty:g}, MJX"
     )
-    for name in ("kind", "controller", "no fall", "lasts", "ankles", "yaw", "trunk", "trunk tilt"):
-        table.add_column(name, justify="left" if name in ("kind", "controller") else "right")
+    for name in ("kind", "control", "no fall", "lasts", "ankles", "yaw", "trunk", "tilt"):
+        table.add_column(name, justify="left" if name in ("kind", "control") else "right")
     for pair in zip(*rows.values(), strict=True):
         for name, row in zip(rows, pair, strict=True):
             table.add_row(

@@ -142,7 +142,7 @@ def _show_table(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum,
 
     difficulty = EVALUATION_DIFFICULTY
     rows: dict[str, list[evaluation.Row]] = {}
-    for name, controller in (("inverse kinematics", None), ("trained", trained)):
+    for name, controller in (("IK alone", None), ("trained", trained)):
         console.print(f"evaluating {name} (compiling takes about half a minute)", highlight=False)
         rows[name] = evaluation.by_kind(plan, controller, difficulty, plan.evaluation_episodes, EVALUATION_SEED)
     console.print(evaluation.comparison(plan, difficulty, rows))

@@ -57,6 +57,7 @@ def train(
         params = _run_call(config, call, seed, params, progress, wants_to_stop)
         run.save_checkpoint(call.index, to_arrays(params), {"seed": seed})
         progress.finished(call)
+        jax.clear_caches()  # a call's programs serve no other call, and each holds hundreds of megabytes
     return params
 
 

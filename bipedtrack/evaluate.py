@@ -1,0 +1,299 @@
+"""`python -m bipedtrack.evaluate POLICY`: tracking error of every step, for any policy, on two simulators."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import pathlib
+import time
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, tasks, trace, versions
+from bipedtrack.messages import fail
+
+if TYPE_CHECKING:
+    from bipedtrack import suite
+
+SEED = 2024
+ENGINES = ("mjx", "mujoco", "converged")
+_GRAVITY = 9.81  # m/s^2
+_TRACES = 2  # episodes of each task whose traces are written
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Evaluates policies on the tasks of the suite or on a footstep script: table, metrics.json, report.html, traces."""
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Policy files or run directories; `ik`: feedforward alone; `zero`: joint targets stay where they were at first."""
+    tasks: tuple[str, ...] = ()
+    """Tasks of the suite; all when not given."""
+    script: pathlib.Path | None = None
+    """A footstep script instead of the tasks."""
+    episodes: int = 256
+    """Of each task."""
+    seconds: float = 10.0
+    """Of each episode; scripts last as long as they take."""
+    engine: Literal["mjx", "mujoco", "both"] = "both"
+    """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one."""
+    seed: int = SEED
+    """Decides the episodes, together with the task's name."""
+    out: pathlib.Path = pathlib.Path("evaluation")
+    """Where metrics.json, report.html and traces/ go."""
+    robustness: bool = False
+    """Also pushes, payload, friction, motors, delay, noise and masses, in C."""
+    feedback_ratio: float | None = None
+    """Another k_b for every joint."""
+    filter: float | None = None
+    """Another filter coefficient of eq (7)."""
+    velocity_feedforward: bool | None = None
+    """With or without (kd/kp) dq/dt."""
+    feedforward: bool = True
+    """--no-feedforward: the feedforward stays at the first command's (MuJoCo C only)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """Something to evaluate."""
+
+    name: str
+    robot: robot.Robot
+    settings: control.ControlConfig
+    policy_period: float  # s
+    network: policy.Network | None  # None: no feedback
+    activation: str
+    feedforward: bool
+    provenance: dict[str, Any]
+
+    def act(self, observation: Any) -> Any:
+        """The network's output, (12,), for an observation, (101,)."""
+        if self.network is None:
+            return 0 * observation[:12]
+        return policy.apply(self.network, self.activation, observation)
+
+
+def subject(name: str, options: Evaluate) -> Subject:
+    """What a policy argument names, with the options' ablations. Raises in one line where there is no such policy."""
+    if name in ("ik", "zero"):
+        the_robot, settings, period = robot.load(), control.ControlConfig(level_feet=True), 0.02
+        network, activation, provenance = None, "swish", {}
+    else:
+        path = pathlib.Path(name)
+        loaded = policy.load(path / "policy.npz" if path.is_dir() else path, robot.load())
+        the_robot, settings, period = loaded.robot, loaded.settings, loaded.policy_period
+        network, activation, provenance = loaded.network, loaded.activation, loaded.provenance
+    if options.filter is not None:
+        settings = dataclasses.replace(settings, filter=options.filter)
+    if options.velocity_feedforward is not None:
+        settings = dataclasses.replace(settings, velocity_feedforward=options.velocity_feedforward)
+    if options.feedback_ratio is not None:
+        ratio = np.full_like(the_robot.feedback_ratio, options.feedback_ratio)
+        the_robot = dataclasses.replace(the_robot, feedback_ratio=ratio)
+    feedforward = options.feedforward and name != "zero"
+    return Subject(name, the_robot, settings, period, network, activation, feedforward, provenance)
+
+
+class Engines:
+    """The recorders of one subject, each compiled once."""
+
+    def __init__(self, who: Subject, engine: str):
+        """engine: mjx, mujoco or both."""
+        from bipedtrack import recording
+
+        self._who = who
+        self.names = [n for n in ENGINES if engine == "both" or (n == "mjx") == (engine == "mjx")]
+        self._controls = recording.Controls(who.robot, who.settings, who.policy_period, who.act, who.feedforward)
+        self._mjx: dict[Any, Any] = {}
+
+    def record(self, name: str, batch: suite.Batch, seconds: float, **hooks: Any) -> trace.Trace:
+        """The trace of a batch in one engine."""
+        from bipedtrack import recording
+
+        if name != "mjx":
+            converged = name == "converged"
+            return recording.in_mujoco(self._controls, batch.plan, batch.sizes, seconds, converged, **hooks)
+        if batch.sizes not in self._mjx:
+            self._mjx[batch.sizes] = self._compile(batch)
+        return self._mjx[batch.sizes](batch.plan, seconds)
+
+    def _compile(self, batch: suite.Batch) -> Any:
+        import jax
+
+        from bipedtrack import env, plans, recording, rewards
+
+        settings = env.EnvConfig(rewards.RewardConfig(), self._who.settings, self._who.policy_period)
+        first = jax.tree.map(lambda leaf: leaf[0], batch.plan)
+        the_env = env.TrackingEnv(self._who.robot, settings, first, plans.PLANNED, batch.sizes, touch=True)
+        return recording.mjx_recorder(the_env, self._who.act)
+
+
+def boxes_of(batch: suite.Batch) -> metrics.Boxes | None:
+    """The boxes of a batch for the clearance; None where there are none."""
+    if not batch.sizes:
+        return None
+    # a window of three treads holds every tread once if looked at every third task step
+    stairs = len({tuple(pose) for pose in np.asarray(batch.plan.boxes[0]).reshape(-1, 7)}) > len(batch.sizes)
+    poses = np.asarray(batch.plan.boxes)[:, 1::3] if stairs else np.asarray(batch.plan.boxes)[:, :1]
+    count = poses.shape[1]
+    poses = poses.reshape(len(poses), -1, 7)
+    half = np.broadcast_to(np.tile(np.array(batch.sizes) / 2, (count, 1)), (len(poses), poses.shape[1], 3))
+    return metrics.Boxes(poses[..., :3], half, 2 * np.arctan2(poses[..., 6], poses[..., 3]))
+
+
+def run(options: Evaluate) -> dict[str, Any]:
+    """Evaluates everything asked for, writes it to `out` and returns what metrics.json holds."""
+    who = [subject(name, options) for name in options.policies]
+    wanted = _tasks(options)
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "traces").mkdir(exist_ok=True)
+    record: dict[str, Any] = {
+        "options": {k: str(v) if isinstance(v, pathlib.Path) else v for k, v in dataclasses.asdict(options).items()},
+        "versions": {row.name: row.found for row in versions.check()},
+        "policies": {one.name: one.provenance for one in who},
+        "tasks": {},
+    }
+    for number, one in enumerate(who):
+        engines = Engines(one, options.engine)
+        weight = float(_GRAVITY * robot.build_model(one.robot.name).body_mass.sum())
+        stem = f"{number}-{pathlib.Path(one.name).stem}"  # two policies may have the same file name
+        for name in wanted:
+            batch, seconds = _batch(name, options, one.robot)
+            boxes = boxes_of(batch)
+            entry = record["tasks"].setdefault(name, {"ranges": batch.ranges, "seconds": seconds, "policies": {}})
+            entry["boxes"] = [] if boxes is None else _boxes_of_first(boxes)
+            results = entry["policies"].setdefault(one.name, {})
+            for engine in engines.names:
+                began = time.monotonic()
+                recorded = engines.record(engine, batch, seconds)
+                summary = metrics.summarise(recorded, one.robot, weight, boxes)
+                course = metrics.time_course(recorded)
+                results[engine] = {"summary": summary, "course": {k: _thin(v) for k, v in course.items()}}
+                results[engine]["path"] = _path(recorded.episode(0))
+                if engine != "converged":
+                    for episode in range(min(_TRACES, len(recorded.alive))):
+                        file = options.out / "traces" / f"{stem}-{engine}-{name}-{episode}.npz"
+                        trace.save(recorded.episode(episode), file)
+                print(f"{line(one.name, name, engine, summary)}  ({time.monotonic() - began:.0f} s)", flush=True)
+        if options.robustness:
+            record.setdefault("robustness", {})[one.name] = _robustness(engines, one, options, weight)
+    return record
+
+
+def _tasks(options: Evaluate) -> tuple[str, ...]:
+    """The names of the tasks. Raises ConfigError for an unknown one."""
+    from bipedtrack import suite
+
+    if options.script is not None:
+        return (options.script.stem,)
+    for name in options.tasks:
+        if name not in suite.TASKS:
+            raise config.ConfigError(f"--tasks {name}: no such task; there are: {', '.join(suite.TASKS)}")
+    return options.tasks or suite.TASKS
+
+
+def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.Batch, float]:
+    """A task's episodes and how long they last, s."""
+    from bipedtrack import suite
+
+    if options.script is not None or name in suite.SCRIPTS:
+        path = options.script or suite.script_path(name)
+        script = footsteps.load(path, the_robot)
+        # a script is the same every time: more episodes would tell nothing
+        return suite.script_batch(script, 1), footsteps.duration(script)
+    return suite.batch(name, tasks.Ranges(), the_robot, options.episodes, options.seconds, options.seed), options.seconds
+
+
+def _thin(values: np.ndarray) -> list[float | None]:
+    """Every tenth value, for curves that are drawn a few hundred points wide."""
+    return [None if not np.isfinite(v) else round(float(v), 4) for v in values[::10]]
+
+
+def _boxes_of_first(boxes: metrics.Boxes) -> list[list[float]]:
+    """The first episode's boxes: x, y, z of the centre, length, width, height, m, and yaw, rad."""
+    return np.column_stack([boxes.centres[0], 2 * boxes.half_sizes[0], boxes.yaws[0]]).round(4).tolist()
+
+
+def _path(recorded: trace.Trace) -> dict[str, Any]:
+    """Where the nodes of one episode were meant to be and were, until its fall: x, y, z in m, every tenth control step."""
+    up = int(recorded.alive.sum())
+    found: dict[str, Any] = {"time_s": _thin(recorded.time[:up])}
+    for side, state in (("target", recorded.target), ("measured", recorded.measured)):
+        points = {"trunk": state.trunk_position, **{leg: state.ankle_positions[:, i] for i, leg in enumerate(robot.LEGS)}}
+        found[side] = {node: np.round(at[:up:10], 4).tolist() for node, at in points.items()}
+    return found
+
+
+def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float) -> dict[str, Any]:
+    """Survival and ankle error while walking forward, over the levels of every disturbance."""
+    from bipedtrack import disturbances, suite
+
+    episodes = min(options.episodes, 64)
+    batch = suite.batch("walk-forward", tasks.Ranges(), who.robot, episodes, options.seconds, options.seed)
+    found: dict[str, Any] = {}
+    for name, ladder in disturbances.LADDERS.items():
+        rows = []
+        for level in ladder.levels:
+            hooks = ladder.hooks(level, who.robot.timestep)._asdict()
+            recorded = engines.record("mujoco", batch, options.seconds, **hooks)
+            summary = metrics.summarise(recorded, who.robot, weight)
+            rows.append({"level": level, "survival": summary["survival"], "errors": summary["errors"]})
+            print(f"{name} {level:g} {ladder.unit}: {100 * summary['survival']['share']:.0f} % without a fall", flush=True)
+        found[name] = {"unit": ladder.unit, "levels": rows, "episodes": episodes, "task": "walk-forward"}
+    return found
+
+
+def line(who: str, task: str, engine: str, summary: dict[str, Any]) -> str:
+    """One line of the table: survival, ankle and trunk errors, foothold error."""
+    errors, touchdown = summary["errors"], summary["touchdown"]
+    ankles = [errors[f"{leg}_ankle_position_cm"]["mean"] for leg in robot.LEGS]
+    yaws = [errors[f"{leg}_ankle_yaw_deg"]["mean"] for leg in robot.LEGS]
+    worst = max(errors[f"{leg}_ankle_position_cm"]["p95"] for leg in robot.LEGS)
+    foothold = touchdown["foothold_cm"]["mean"]
+    return (
+        f"{pathlib.Path(who).stem:<10} {task:<20} {engine:<9} {100 * summary['survival']['share']:5.1f} % up"
+        f"  ankles {np.mean(ankles):5.2f} cm (95 %: {worst:5.1f}) {np.mean(yaws):5.2f} deg"
+        f"  trunk {errors['trunk_position_cm']['mean']:5.1f} cm {errors['trunk_orientation_deg']['mean']:5.1f} deg"
+        + (f"  foothold {foothold:4.1f} cm" if foothold is not None else "")
+    )
+
+
+def main() -> None:
+    """The command line. Exit status 0 when evaluated, 2 for bad input."""
+    options = tyro.cli(Evaluate, prog="python -m bipedtrack.evaluate")
+    try:
+        versions.require()
+        _check(options)
+        with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
+            from bipedtrack import recording  # noqa: F401
+        record = run(options)
+        from bipedtrack import report
+
+        record["verdicts"] = report.verdicts(record)
+        checkpoint.write_json(options.out / "metrics.json", record)
+        page = options.out / "report.html"
+        checkpoint.write_text(page, report.page(record))
+        print(page)
+    except (ValueError, RuntimeError, OSError) as error:
+        fail(str(error))
+
+
+def _check(options: Evaluate) -> None:
+    """Raises ConfigError for options that cannot be."""
+    if not options.policies:
+        raise config.ConfigError("name at least one policy: a policy.npz, a run directory, ik or zero")
+    if options.episodes < 1:
+        raise config.ConfigError(f"--episodes {options.episodes}: must be at least 1")
+    if not 0.1 <= options.seconds <= 600:
+        raise config.ConfigError(f"--seconds {options.seconds}: must lie in [0.1, 600]")
+    if options.feedback_ratio is not None and not 0 <= options.feedback_ratio <= 2:
+        raise config.ConfigError(f"--feedback-ratio {options.feedback_ratio}: must lie in [0, 2]")
+    if (not options.feedforward or "zero" in options.policies) and options.engine != "mujoco":
+        raise config.ConfigError("--no-feedforward and the policy zero run in MuJoCo C only: add --engine mujoco")
+
+
+if __name__ == "__main__":
+    main()

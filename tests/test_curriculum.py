@@ -1,0 +1,212 @@
+"""The shipped curricula, Table III by hand, the calls that a curriculum becomes, and every refusal with its place."""
+
+import itertools
+import pathlib
+
+import pytest
+
+from bipedtrack import config, curriculum, paths
+from bipedtrack.curriculum import Curriculum, calls, load
+
+MINIMAL = """name = "mine"
+
+[[stages]]
+name = "ground"
+shares = { stand = 1, squat = 0, walk = 2, sidle = 0, turn = 0, stairs = 0 }
+learning_rate = [4e-4, 1e-4]
+entropy_cost = [0.01, 0.0]
+clipping_epsilon = [0.2, 0.1]
+lessons = [
+  { name = "short", steps = 103, difficulty = 0.25, parts = 4 },
+  { name = "long", steps = 97, difficulty = 1.0, parts = 2 },
+]
+
+[[stages]]
+name = "hold"
+shares = { stand = 1, squat = 1, walk = 1, sidle = 1, turn = 1, stairs = 1 }
+learning_rate = [1e-4, 1e-4]
+entropy_cost = [0.001, 0.001]
+clipping_epsilon = [0.1, 0.1]
+hold_share = 0.5
+lessons = [{ name = "all", steps = 50, difficulty = 1.0 }]
+"""
+
+
+def loaded(folder: pathlib.Path, text: str) -> Curriculum:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return load(str(path))
+
+
+# The curricula that ship
+
+
+@pytest.mark.parametrize("name", ["quick", "smoke", "paper"])
+def test_a_shipped_curriculum_loads_by_name_and_by_path_and_has_three_stages(name: str) -> None:
+    plan = load(name)
+    assert plan == load(str(paths.data_dir("curricula") / f"{name}.toml"))
+    assert plan.name == name and len(plan.stages) == 3
+    first, second, third = plan.stages
+    assert first.shares.stairs == 0 and first.hold_share == 0
+    assert second.shares.stairs > 0 and second.hold_share == 0
+    assert third.hold_share > 0
+    assert config.from_dict(Curriculum, config.to_dict(plan), "again") == plan
+
+
+def test_the_default_reward_leaves_no_shipped_curriculum_without_its_terms() -> None:
+    for name in ("quick", "smoke", "paper"):
+        weights = load(name).rewards.weights
+        assert min(weights) >= 0 and weights.left_ankle_position == weights.right_ankle_position > 0
+    assert load("paper").rewards.weights.feedback_rate == 0  # not one of the paper's terms
+
+
+def test_paper_is_table_iii() -> None:
+    plan = load("paper")
+    ppo = plan.ppo
+    assert ppo.steps_per_update == 20480  # buffer size
+    assert ppo.num_envs * ppo.unroll_length // ppo.num_minibatches == 2048  # batch size
+    assert ppo.num_epochs == 3 and ppo.gae_lambda == 0.95 and ppo.discount == 0.995
+    assert plan.network.actor == (512, 512, 512) and plan.network.critic == (128, 128)
+    assert plan.policy_period == 0.005 and plan.episode_length == 2000
+    assert [stage.learning_rate for stage in plan.stages] == [(3e-4, 0), (2e-4, 0), (1e-4, 0)]
+    assert [stage.entropy_cost[0] for stage in plan.stages] == [0.02, 0.015, 0.007]  # beta
+    assert [stage.clipping_epsilon[0] for stage in plan.stages] == [0.2, 0.15, 0.07]  # epsilon
+    assert sum(stage.steps for stage in plan.stages) == 300_000_000
+
+
+def test_paper_follows_the_falling_lines_of_its_stages() -> None:
+    made = calls(load("paper"))
+    assert sum(call.steps for call in made) == 300_000_000
+    # stage 1: 150 M steps in calls of 10 M, so the first call's middle is 5 M and its last one's 145 M
+    first, last = made[0], [call for call in made if call.stage.name == "level ground"][-1]
+    assert first.learning_rate == pytest.approx(3e-4 * 145 / 150) and last.learning_rate == pytest.approx(3e-4 * 5 / 150)
+    assert first.entropy_cost == pytest.approx(0.02 * 145 / 150)
+    assert last.clipping_epsilon == pytest.approx(0.2 - 0.1 * 145 / 150)
+    for one, other in itertools.pairwise(made):
+        if one.stage is other.stage:
+            assert other.learning_rate < one.learning_rate and other.entropy_cost < one.entropy_cost
+            assert other.clipping_epsilon <= one.clipping_epsilon
+            assert other.lesson.difficulty >= one.lesson.difficulty
+
+
+# Calls
+
+
+def test_calls_share_the_steps_of_their_lessons(tmp_path: pathlib.Path) -> None:
+    made = calls(loaded(tmp_path, MINIMAL))
+    assert [call.index for call in made] == list(range(7))
+    assert [call.lesson.name for call in made] == ["short"] * 4 + ["long"] * 2 + ["all"]
+    assert [call.stage.name for call in made] == ["ground"] * 6 + ["hold"]
+    assert [call.steps for call in made] == [26, 26, 26, 25, 49, 48, 50]
+
+
+def test_a_call_takes_the_value_of_its_middle_on_the_falling_line_of_its_stage(tmp_path: pathlib.Path) -> None:
+    made = calls(loaded(tmp_path, MINIMAL))
+    # 200 steps in the first stage; the calls' middles by hand
+    for call, middle in zip(made, [13, 39, 65, 90.5, 127.5, 176], strict=False):
+        assert call.learning_rate == pytest.approx(4e-4 - 3e-4 * middle / 200)
+        assert call.entropy_cost == pytest.approx(0.01 - 0.01 * middle / 200)
+        assert call.clipping_epsilon == pytest.approx(0.2 - 0.1 * middle / 200)
+    assert (made[6].learning_rate, made[6].entropy_cost, made[6].clipping_epsilon) == (1e-4, 0.001, 0.1)
+
+
+def test_episode_length_counts_policy_steps(tmp_path: pathlib.Path) -> None:
+    assert loaded(tmp_path, "policy_period = 0.02\nepisode_seconds = 10\n" + MINIMAL).episode_length == 500
+    assert loaded(tmp_path, "policy_period = 0.005\nepisode_seconds = 0.7\n" + MINIMAL).episode_length == 140
+
+
+# Refusals
+
+
+def refused(folder: pathlib.Path, text: str) -> str:
+    """The one line, without the file's name, by which a curriculum is refused."""
+    with pytest.raises(config.ConfigError) as caught:
+        loaded(folder, text)
+    line = str(caught.value)
+    start = f"{folder / 'mine.toml'}: "
+    assert line.startswith(start) and "\n" not in line
+    return line.removeprefix(start)
+
+
+ADDED = [  # what is put in front, and the line it gives
+    ("[rewards.weights]\n", "rewards.weights: missing keys without a default; wanted live"),
+    ("[ranges]\nwalk_stp = [0, 0, 0]\n", "ranges.walk_stp: unknown key; did you mean 'walk_step'?"),
+    ("[ranges]\nwalk_step = [0, 0]\n", "ranges.walk_step: [0, 0] (list) has the length 2; wanted a list of 3"),
+    ("[ranges]\nlift = [0.1, 0.05, 0.2]\n", "ranges: lift must be [lowest, mildest, highest], not [0.1, 0.05, 0.2]"),
+    ("[ranges]\nperiod = [0, 0.5, 0.7]\n", "ranges: periods must be positive"),
+    (
+        "[rewards.sharpness]\nankle_positon = 1\n",
+        "rewards.sharpness.ankle_positon: unknown key; did you mean 'ankle_position'?",
+    ),
+    ("[ppo]\nnum_env = 8\n", "ppo.num_env: unknown key; did you mean 'num_envs'?"),
+    ("[ppo]\nnum_envs = 8.0\n", "ppo.num_envs: 8.0 (float) does not fit; wanted an integer"),
+    ("[ppo]\nnum_envs = 8\nnum_minibatches = 3\n", "ppo: num_envs (8) must be a multiple of num_minibatches (3)"),
+    ("[ppo]\nnum_epochs = 0\n", "ppo: num_envs, unroll_length, num_minibatches and num_epochs must be at least 1"),
+    ("[network]\nactor = []\n", "network: actor and critic need at least one hidden layer"),
+    ("[network]\nactivation = 'Swish'\n", "network.activation: 'Swish' (string) is not allowed; did you mean 'swish'?"),
+    ("[control]\nfilter = 0\n", "control: filter must lie in (0, 1], not 0"),
+    ("policy_period = -0.02\n", "policy_period must be positive and no longer than episode_seconds"),
+    ("policy_period = 0.02\nepisode_seconds = 0.01\n", "policy_period must be positive and no longer than episode_seconds"),
+    ("evaluation_episodes = -1\n", "evaluation_episodes must not be negative"),
+    ("policy_period = nan\n", "policy_period: nan (float) does not fit; wanted a finite number"),
+    ("stage = 1\n", "stage: unknown key; did you mean 'stages'?"),
+]
+CHANGED = [  # what stands there, what shall stand there, and the line it gives
+    ("difficulty = 0.25", "difficulty = 1.25", "stages[0].lessons[0]: difficulty must lie in [0, 1], not 1.25"),
+    ("difficulty = 0.25", "dificulty = 0.25", "stages[0].lessons[0].dificulty: unknown key; did you mean 'difficulty'?"),
+    ("steps = 97, ", "", "stages[0].lessons[1]: missing key without a default; wanted steps (an integer)"),
+    ("steps = 97", "steps = 0", "stages[0].lessons[1]: steps and parts must be at least 1"),
+    ("parts = 4", "parts = 0", "stages[0].lessons[0]: steps and parts must be at least 1"),
+    ("turn = 0", "turns = 0", "stages[0].shares.turns: unknown key; did you mean 'turn'?"),
+    ("stand = 1, squat = 0, walk = 2", "stand = 0, squat = 0, walk = 0", "stages[0].shares: shares must not be negative"),
+    ("walk = 2", "walk = -2", "stages[0].shares: shares must not be negative"),
+    ("[4e-4, 1e-4]", "4e-4", "stages[0].learning_rate: 0.0004 (float) does not fit; wanted a list of 2"),
+    ("[4e-4, 1e-4]", '["4e-4", 0]', "stages[0].learning_rate[0]: '4e-4' (string) does not fit; wanted a finite number"),
+    ("hold_share = 0.5", "hold_share = 1.5", "stages[1]: hold_share must lie in [0, 1], not 1.5"),
+    (
+        "hold_share = 0.5",
+        "hold_after = [3, 1]",
+        "stages[1]: hold_after must be two growing numbers of task steps, not [3, 1]",
+    ),
+    ('lessons = [{ name = "all", steps = 50, difficulty = 1.0 }]', "lessons = []", "stages[1]: stage 'hold' has no lessons"),
+]
+
+
+@pytest.mark.parametrize(("added", "wanted"), ADDED)
+def test_a_wrong_setting_is_refused_by_its_place(tmp_path: pathlib.Path, added: str, wanted: str) -> None:
+    head, stages = MINIMAL.split("\n\n", 1)
+    assert refused(tmp_path, f"{head}\n{added}\n{stages}").startswith(wanted)
+
+
+@pytest.mark.parametrize(("there", "instead", "wanted"), CHANGED)
+def test_a_wrong_stage_is_refused_by_its_place(tmp_path: pathlib.Path, there: str, instead: str, wanted: str) -> None:
+    assert MINIMAL.count(there) == 1
+    assert refused(tmp_path, MINIMAL.replace(there, instead)).startswith(wanted)
+
+
+def test_a_misspelt_weight_is_refused(tmp_path: pathlib.Path) -> None:
+    weights = "".join(f"{name} = 1\n" for name in load("quick").rewards.weights._fields)
+    assert loaded(tmp_path, MINIMAL.replace("\n\n", f"\n[rewards.weights]\n{weights}\n", 1)).rewards.weights.live == 1
+    text = weights.replace("left_ankle_yaw", "left_ankel_yaw")
+    line = refused(tmp_path, MINIMAL.replace("\n\n", f"\n[rewards.weights]\n{text}\n", 1))
+    assert line.startswith("rewards.weights.left_ankel_yaw: unknown key; did you mean 'left_ankle_yaw'?")
+
+
+def test_a_curriculum_without_stages_is_refused(tmp_path: pathlib.Path) -> None:
+    assert refused(tmp_path, 'name = "mine"\nstages = []\n') == "a curriculum needs at least one stage"
+    assert refused(tmp_path, 'name = "mine"\n').startswith("missing key without a default; wanted stages")
+
+
+def test_an_unknown_name_lists_the_curricula_there_are() -> None:
+    with pytest.raises(config.ConfigError) as caught:
+        load("qick")
+    line = str(caught.value)
+    assert "'qick'" in line and "\n" not in line
+    listed = line.rpartition("there are: ")[2].split(", ")
+    assert listed == sorted(path.stem for path in paths.data_dir("curricula").glob("*.toml"))
+    assert {"paper", "quick", "smoke"} <= set(listed)
+
+
+def test_a_missing_file_is_refused_by_its_path(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(config.ConfigError, match="gone.toml: cannot be read"):
+        curriculum.load(str(tmp_path / "gone.toml"))

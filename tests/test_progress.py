@@ -1,0 +1,160 @@
+"""What a training shows: JSON lines and TensorBoard events of the same figures, lines or a live table of them."""
+
+import json
+import pathlib
+import re
+import struct
+import time
+
+import pytest
+from tensorboardX.proto import event_pb2
+
+from bipedtrack import curriculum, progress
+from bipedtrack.progress import Progress
+
+PLAN = curriculum.load("smoke")  # three calls of 64 policy steps
+CALLS = curriculum.calls(PLAN)
+FIGURES = {
+    "episode_seconds": 4.25,
+    "falls": 0.375,
+    "ankle_error_cm": 5.5,
+    "ankle_yaw_error_deg": 2.25,
+    "trunk_error_cm": 7.75,
+    "trunk_error_deg": 3.5,
+    "reward_per_step": 2.625,
+    "kl_mean": 0.0125,
+}
+
+
+def events(folder: pathlib.Path) -> dict[tuple[str, int], float]:
+    """The scalars of TensorBoard's event files by name and step: records of length, checksum, event, checksum."""
+    scalars = {}
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        content, at = path.read_bytes(), 0
+        while at < len(content):
+            (length,) = struct.unpack_from("<Q", content, at)
+            event = event_pb2.Event.FromString(content[at + 12 : at + 12 + length])
+            for value in event.summary.value:
+                scalars[value.tag, event.step] = value.simple_value
+            at += length + 16
+    return scalars
+
+
+def lines(folder: pathlib.Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+
+
+def test_json_lines_and_tensorboard_hold_the_same_figures(tmp_path: pathlib.Path) -> None:
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        shown.compiling(CALLS[0], "a program")
+        shown.update(CALLS[0], 20, FIGURES)
+        shown.update(CALLS[0], 64, {name: 2 * value for name, value in FIGURES.items()})
+        shown.finished(CALLS[0])
+        shown.update(CALLS[1], 10, {name: 3 * value for name, value in FIGURES.items()})
+    rows = lines(tmp_path)
+    assert [row["steps"] for row in rows] == [20, 64, 74]
+    assert [(row["stage"], row["lesson"], row["call"]) for row in rows] == [
+        ("level ground", "half difficulty", 0),
+        ("level ground", "half difficulty", 0),
+        ("stairs", "low risers", 1),
+    ]
+    assert [{name: row[name] for name in FIGURES} for row in rows] == [
+        {name: factor * value for name, value in FIGURES.items()} for factor in (1, 2, 3)
+    ]
+    assert all(abs(row["time"] - time.time()) < 60 for row in rows)
+    scalars = events(tmp_path / "tensorboard")
+    in_lines = {(name, row["steps"]): row[name] for row in rows for name in FIGURES}
+    assert {key: scalars[key] for key in in_lines} == pytest.approx(in_lines, rel=1e-6)
+    assert {step for _, step in scalars} == {20, 64, 74}
+
+
+def test_a_resumed_training_counts_on_from_the_finished_calls(tmp_path: pathlib.Path) -> None:
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        shown.update(CALLS[0], 64, FIGURES)
+    time.sleep(1.1)  # event files are named by the second
+    with Progress(tmp_path, PLAN, CALLS, 64) as shown:
+        shown.update(CALLS[1], 30, FIGURES)
+    assert [row["steps"] for row in lines(tmp_path)] == [64, 94]
+    assert {step for _, step in events(tmp_path / "tensorboard")} == {64, 94}
+
+
+def test_figures_that_are_not_finite_do_not_spoil_the_lines(tmp_path: pathlib.Path) -> None:
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        shown.update(CALLS[0], 20, FIGURES | {"kl_mean": float("nan"), "falls": float("inf")})
+    assert lines(tmp_path)[0]["kl_mean"] is None and lines(tmp_path)[0]["falls"] is None
+
+
+def test_without_a_terminal_lines_name_stage_steps_speed_and_time_left(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_EVERY", 0.0)
+    with Progress(tmp_path, PLAN, CALLS, 64) as shown:
+        shown.compiling(CALLS[1], "the learner")
+        shown.update(CALLS[1], 10, FIGURES)
+        began = time.monotonic()
+        time.sleep(0.4)
+        shown.update(CALLS[1], 30, FIGURES)
+        took = time.monotonic() - began
+        shown.say("a warning")
+    compiling, first, second, warning = capsys.readouterr().out.splitlines()
+    for line in (compiling, first, second):
+        assert "stairs, low risers (call 2 of 3)" in line
+    assert "compiling the learner" in compiling and "training" in second
+    assert warning == "a warning" and "\x1b" not in second
+    for text in ("4.2 s, 38 % fall", "5.5 cm, 2.2 deg", "7.8 cm, 3.5 deg", "2.62 a step"):
+        assert text in second
+    assert "steps/s" not in first  # one point is no rate
+    speed = float(re.search(r"(\d+) steps/s", second)[1])
+    assert speed == pytest.approx(20 / took, rel=0.1)
+    assert re.search(r"\d+ min left", second)
+    assert lines(tmp_path)[1]["steps_per_second"] == pytest.approx(20 / took, rel=0.1)
+    assert "0.00 of 0.00 M" in second
+
+
+def test_time_left_is_the_rest_of_all_calls_at_the_present_speed(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_EVERY", 0.0)
+    plan = curriculum.load("quick")
+    calls = curriculum.calls(plan)
+    total = sum(call.steps for call in calls)
+    with Progress(tmp_path, plan, calls, 0) as shown:
+        shown.update(calls[0], 1000, FIGURES)
+        began = time.monotonic()
+        time.sleep(0.3)
+        shown.update(calls[0], 2000, FIGURES)
+        took = time.monotonic() - began
+    second = capsys.readouterr().out.splitlines()[1]
+    minutes = (total - 2000) / (1000 / took) / 60
+    assert float(re.search(r"(\d+) min left", second)[1]) == pytest.approx(minutes, rel=0.1)
+    assert f"of {total / 1e6:.2f} M" in second
+
+
+def test_lines_come_no_oftener_than_they_should(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        shown.compiling(CALLS[0], "the learner")
+        for steps in range(1, 20):
+            shown.update(CALLS[0], steps, FIGURES)
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    assert len(lines(tmp_path)) == 19
+
+
+def test_in_a_terminal_a_table_is_kept_up_to_date(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        shown.compiling(CALLS[0], "the learner")
+        shown.update(CALLS[0], 20, FIGURES)
+        shown.say("beside the table")
+    out = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().out)
+    for text in (
+        "compiling the learner",
+        "level ground, half difficulty (call 1 of 3)",
+        "5.5 cm, 2.2 deg",
+        "beside the table",
+    ):
+        assert text in out
+    assert "|" not in out
