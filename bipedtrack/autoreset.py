@@ -3,7 +3,8 @@
 When an episode ends at step t, the state keeps its terminal observation; the *next* step ignores the action and begins a
 new episode (new task, task step, robot, filter), with reward 0 and `truncation` 1. With brax's `compute_gae` this is
 exact: at a time limit the value of step t bootstraps from the terminal observation, which is the observation of
-step t + 1; at a fall it does not (done = 1); and the step that begins the new episode is masked out of both losses.
+step t + 1; at a fall it does not (done = 1); and
+the step that begins the new episode has no value error and, before brax centres the advantages, no advantage.
 """
 
 from __future__ import annotations

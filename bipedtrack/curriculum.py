@@ -7,6 +7,7 @@ after another: `calls` spells them out.
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 from typing import Literal
 
@@ -27,8 +28,10 @@ class NetworkConfig:
     normalizer_floor: float = 0.05  # added to the variance of every observation, which may be constant at first
 
     def __post_init__(self) -> None:
-        if min((*self.actor, *self.critic), default=0) < 1:
-            raise ValueError("actor and critic need at least one hidden layer, each of at least one unit")
+        if min(self.actor, default=0) < 1 or min(self.critic, default=0) < 1:
+            raise ValueError("actor and critic need at least one hidden layer each, of at least one unit")
+        if not self.initial_noise > 0 or not self.normalizer_floor >= 0:
+            raise ValueError("initial_noise must be positive and normalizer_floor not negative")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +50,10 @@ class PpoConfig:
     def __post_init__(self) -> None:
         if min(self.num_envs, self.unroll_length, self.num_minibatches, self.num_epochs) < 1:
             raise ValueError("num_envs, unroll_length, num_minibatches and num_epochs must be at least 1")
+        if not (0 < self.discount <= 1 and 0 <= self.gae_lambda <= 1):
+            raise ValueError("discount must lie in (0, 1] and gae_lambda in [0, 1]")
+        if not (self.max_grad_norm > 0 and self.reward_scaling > 0):
+            raise ValueError("max_grad_norm and reward_scaling must be positive")
         if self.num_envs % self.num_minibatches:
             raise ValueError(
                 f"num_envs ({self.num_envs}) must be a multiple of num_minibatches ({self.num_minibatches}): "
@@ -91,6 +98,8 @@ class Stage:
     def __post_init__(self) -> None:
         if not self.lessons:
             raise ValueError(f"stage {self.name!r} has no lessons")
+        if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon) < 0:
+            raise ValueError("learning_rate, entropy_cost and clipping_epsilon must not be negative")
         if not 0 <= self.hold_share <= 1:
             raise ValueError(f"hold_share must lie in [0, 1], not {self.hold_share}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:
@@ -130,6 +139,13 @@ class Curriculum:
     def episode_length(self) -> int:
         """Policy steps until the time limit."""
         return round(self.episode_seconds / self.policy_period)
+
+    def substeps(self, timestep: float) -> int:
+        """Control steps of `timestep` s that a feedback is held. Raises ConfigError where that is no whole number."""
+        ratio = self.policy_period / timestep
+        if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+            raise config.ConfigError(f"policy_period must be a multiple of {timestep} s, not {self.policy_period} s")
+        return round(ratio)
 
 
 @dataclasses.dataclass(frozen=True)

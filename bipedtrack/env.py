@@ -29,6 +29,8 @@ from bipedtrack import (
 )
 from bipedtrack.rotations import Array
 
+_LARGEST = 1e3  # m, rad, m/s or rad/s: a state beyond has exploded; one such number would spoil the normaliser for all
+
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
@@ -181,7 +183,8 @@ class TrackingEnv(brax.envs.Env):
         advance = lambda carry, _: self.control_step(carry[0], carry[1], a_fb)  # noqa: E731
         (physics, episode), answer = jax.lax.scan(advance, (before, episode), length=self.substeps)
 
-        finite = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
+        # false for nan, too
+        finite = (jnp.abs(physics.qpos) < _LARGEST).all() & (jnp.abs(physics.qvel) < _LARGEST).all()
         physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
         command = self.command(episode)
         errors = nodes.difference(command.target, kinematics.measure(self.robot, physics.qpos))

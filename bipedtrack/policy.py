@@ -105,11 +105,13 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
             raise PolicyError("was trained on another observation layout; train or export it with this version")
         robot_meta = dict(meta["robot"]) | {k[6:]: v for k, v in arrays.items() if k.startswith("robot/")}
         robot_meta["joint_names"] = tuple(robot_meta["joint_names"])
-        layers = sum(name.startswith("actor/") for name in arrays) // 2
+        layers = len({name.split("/")[1] for name in arrays if name.startswith("actor/")})
         known = {"normalizer/mean", "normalizer/std", *(f"robot/{name}" for name in ROBOT_SHAPES)}
         known |= {f"actor/{i}/{part}" for i in range(layers) for part in ("weight", "bias")}
-        if stray := sorted(set(arrays) - known):
-            raise PolicyError(f"holds an array {stray[0]}, which no policy has")
+        for missing in sorted(known - set(arrays)):
+            raise PolicyError(f"lacks the array {missing}")
+        for stray in sorted(set(arrays) - known):
+            raise PolicyError(f"holds an array {stray}, which no policy has")
         policy = Policy(
             network=Network(
                 mean=arrays["normalizer/mean"],
@@ -145,8 +147,8 @@ ROBOT_SHAPES = {
 def _check(policy: Policy) -> None:
     """Raises PolicyError where shapes, types or values do not fit together."""
     network, robot = policy.network, policy.robot
-    outputs = [bias.size for bias in network.biases]
-    sizes = [observation.SIZE, *outputs]
+    layers = zip(network.weights, network.biases, strict=True)
+    sizes = [observation.SIZE, *(w.shape[1] if w.ndim == 2 else b.size for w, b in layers)]
     wanted: dict[str, tuple[np.ndarray, tuple[int, ...]]] = {
         "normalizer/mean": (network.mean, (observation.SIZE,)),
         "normalizer/std": (network.std, (observation.SIZE,)),
@@ -157,12 +159,11 @@ def _check(policy: Policy) -> None:
     for name, (array, shape) in wanted.items():
         if array.shape != shape:
             raise PolicyError(f"array {name} has shape {list(array.shape)}; wanted {list(shape)}")
-        if not np.isfinite(array).all():
-            raise PolicyError(f"array {name} is not finite")
-        if not name.startswith("robot/") and array.dtype != np.float32:
-            raise PolicyError(f"array {name} is {array.dtype}; wanted float32")
-    if sizes[-1] != len(robot.joint_names) or len(robot.joint_names) != 12:
-        raise PolicyError(f"the network gives {sizes[-1]} numbers for {len(robot.joint_names)} joints; wanted 12 and 12")
+        kinds = (np.float32, np.float64) if name.startswith("robot/") else (np.float32,)
+        if array.dtype not in kinds or not np.isfinite(array).all():
+            raise PolicyError(f"array {name} is {array.dtype} or not finite; wanted finite {kinds[-1].__name__} numbers")
+    if len(robot.joint_names) != 12 or not network.weights or sizes[-1] != 12:
+        raise PolicyError(f"the network gives {sizes[-1]} numbers; wanted one for each of {len(robot.joint_names)} joints")
     if policy.activation not in ACTIVATIONS:
         raise PolicyError(f"activation {policy.activation!r} is unknown; wanted one of {', '.join(ACTIVATIONS)}")
     if not (network.std > 0).all():

@@ -86,7 +86,7 @@ def run(options: Train) -> None:
         plan, seed = curriculum.of_run(directory)
     else:
         plan, seed = curriculum.load(options.curriculum), options.seed
-        robot.load(plan.robot)
+        plan.substeps(robot.load(plan.robot).timestep)
         settings = {"curriculum": config.to_dict(plan), "seed": seed, "versions": _versions()}
         directory = checkpoint.RunDirectory.create(folder, settings)
     try:
@@ -127,6 +127,8 @@ def _train(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed
                 f"  python -m bipedtrack.train --resume --out {directory.path}"
             )
             sys.exit(130)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     trained = training.to_policy(plan, training.to_arrays(params), training.provenance(plan, seed, len(calls)))
     path = directory.path / "policy.npz"
     policy.save(trained, path)

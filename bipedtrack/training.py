@@ -19,7 +19,7 @@ from brax.training.agents.ppo import train as ppo
 from flax import linen
 
 from bipedtrack import __version__, autoreset, curriculum, env, observation, policy, robot, tasks, versions
-from bipedtrack.checkpoint import CheckpointError, RunDirectory
+from bipedtrack.checkpoint import CheckpointError, RunDirectory, RunError
 from bipedtrack.progress import Progress
 
 _UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
@@ -75,12 +75,19 @@ def _run_call(
     epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
     the_env = make_env(config, call.stage, call.lesson.difficulty)
 
+    failures: list[RunError] = []
+
     def report(steps: int, metrics: dict[str, Any]) -> None:
         # brax also reports after each epoch, without a word on episodes
         if "episode/length" in metrics:
-            progress.update(call, steps, _figures(metrics, config.policy_period))
+            try:
+                progress.update(call, steps, _figures(metrics, config.policy_period))
+            except RunError as error:  # raised here, inside a callback of JAX, it would come out as an error of JAX
+                failures.append(error)
 
     def look(steps: int, make_policy: Any, params: Any) -> None:
+        if failures:
+            raise failures[0]
         if wants_to_stop():
             raise Stopped
 
