@@ -6,7 +6,7 @@ INSTALLED := .venv/.installed
 # Debian's Python comes without ensurepip, which venv uses; its pip can stand in.
 VENV_BY_PIP = { '$(PYTHON)' -m venv --without-pip .venv && '$(PYTHON)' -m pip --python .venv install --quiet pip; }
 
-.PHONY: setup test train format lock clean
+.PHONY: setup test train demo format lock clean
 
 setup: $(INSTALLED)
 
@@ -28,6 +28,10 @@ test: setup
 
 train: setup
 	$(BIN)/python -m bipedtrack.train $(ARGS)
+
+# Films the policy that ships; needs no screen (EGL or OSMesa).
+demo: setup
+	$(BIN)/python -m bipedtrack.video models/policies/first.npz --script curricula/footsteps/walk.csv --out demo.mp4
 
 format: setup
 	$(BIN)/ruff format .
