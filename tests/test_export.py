@@ -127,7 +127,7 @@ def test_the_file_holds_all_that_acts_between_command_and_joint_targets(exported
 def test_the_provenance_names_curriculum_seed_steps_and_versions(exported):
     provenance = policy.load(exported[2]).provenance
     assert provenance["curriculum"] == "smoke" and provenance["seed"] == SEED
-    assert provenance["steps"] == 64 + 64  # the two calls that are finished, of three
+    assert provenance["steps"] == 192 + 192  # the two calls that are finished, of three
     assert provenance["bipedtrack"] == bipedtrack.__version__
     for name in ("jax", "brax", "mujoco", "numpy"):
         assert provenance["versions"][name] == importlib.metadata.version(name)
@@ -141,7 +141,7 @@ def test_a_curriculums_own_settings_travel_with_the_policy(tmp_path):
     loaded = policy.load(tmp_path / "policy.npz")
     assert [weight.shape for weight in loaded.network.weights] == [(observation.SIZE, 9), (9, 7), (7, 5), (5, 12)]
     assert (loaded.activation, loaded.settings, loaded.policy_period) == ("tanh", control, 0.005)
-    assert loaded.provenance["curriculum"] == "own" and loaded.provenance["steps"] == 64
+    assert loaded.provenance["curriculum"] == "own" and loaded.provenance["steps"] == 192
 
 
 def test_an_export_replaces_an_older_file(tmp_path):
@@ -165,7 +165,7 @@ def test_with_the_newest_checkpoint_damaged_the_one_before_is_exported(tmp_path)
     export.export(run, tmp_path / "policy.npz")
     loaded = policy.load(tmp_path / "policy.npz")
     np.testing.assert_array_equal(loaded.network.mean, random_arrays(PLAN, 0)["0/mean"])
-    assert loaded.provenance["steps"] == 64
+    assert loaded.provenance["steps"] == 192
 
 
 # What is not

@@ -12,7 +12,7 @@ from tensorboardX.proto import event_pb2
 from bipedtrack import curriculum, progress
 from bipedtrack.progress import Progress
 
-PLAN = curriculum.load("smoke")  # three calls of 64 policy steps
+PLAN = curriculum.load("smoke")  # three calls of 192 policy steps
 CALLS = curriculum.calls(PLAN)
 FIGURES = {
     "episode_seconds": 4.25,
@@ -52,7 +52,7 @@ def test_json_lines_and_tensorboard_hold_the_same_figures(tmp_path: pathlib.Path
         shown.finished(CALLS[0])
         shown.update(CALLS[1], 10, {name: 3 * value for name, value in FIGURES.items()})
     rows = lines(tmp_path)
-    assert [row["steps"] for row in rows] == [20, 64, 74]
+    assert [row["steps"] for row in rows] == [20, 64, 202]
     assert [(row["stage"], row["lesson"], row["call"]) for row in rows] == [
         ("level ground", "half difficulty", 0),
         ("level ground", "half difficulty", 0),
@@ -65,7 +65,7 @@ def test_json_lines_and_tensorboard_hold_the_same_figures(tmp_path: pathlib.Path
     scalars = events(tmp_path / "tensorboard")
     in_lines = {(name, row["steps"]): row[name] for row in rows for name in FIGURES}
     assert {key: scalars[key] for key in in_lines} == pytest.approx(in_lines, rel=1e-6)
-    assert {step for _, step in scalars} == {20, 64, 74}
+    assert {step for _, step in scalars} == {20, 64, 202}
 
 
 def test_a_resumed_training_counts_on_from_the_finished_calls(tmp_path: pathlib.Path) -> None:
