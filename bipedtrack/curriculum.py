@@ -144,7 +144,7 @@ class Curriculum:
         """Control steps of `timestep` s that a feedback is held. Raises ConfigError where that is no whole number."""
         ratio = self.policy_period / timestep
         if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
-            raise config.ConfigError(f"policy_period must be a multiple of {timestep} s, not {self.policy_period} s")
+            raise config.ConfigError(f"policy_period {self.policy_period} s is no multiple of {timestep} s")
         return round(ratio)
 
 

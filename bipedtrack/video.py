@@ -343,7 +343,7 @@ def _ffmpeg() -> str:
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
-        raise VideoError("no ffmpeg for .mp4; wanted `pip install 'bipedtrack'`, or a .gif") from None
+        raise VideoError("no ffmpeg for .mp4; wanted `pip install imageio-ffmpeg`, or a .gif") from None
 
 
 def _write_mp4(path: pathlib.Path, frames: Iterator[np.ndarray], size: tuple[int, int], fps: int) -> None:

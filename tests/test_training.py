@@ -151,5 +151,5 @@ def test_only_a_stage_with_stairs_pays_for_boxes() -> None:
 def test_provenance_counts_the_steps_of_the_finished_calls() -> None:
     config = curriculum.load("smoke")
     found = training.provenance(config, 7, 2)
-    assert (found["curriculum"], found["seed"], found["steps"]) == ("smoke", 7, 128)
+    assert (found["curriculum"], found["seed"], found["steps"]) == ("smoke", 7, 384)
     assert found["versions"]["brax"] == "0.14.2" and set(found["versions"]) >= {"jax", "mujoco", "numpy"}

@@ -313,9 +313,9 @@ def test_why_ffmpeg_gave_up_is_told(tmp_path: Path) -> None:
         video._write_mp4(tmp_path / "missing" / "x", frames, SIZE, 30)
 
 
-def test_without_ffmpeg_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_ffmpeg_the_package_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(video.VideoError, match=r"bipedtrack\[video\]"):
+    with pytest.raises(video.VideoError, match="imageio-ffmpeg"):
         video.require_writable(tmp_path / "walk.mp4")
     video.require_writable(tmp_path / "walk.gif")
     assert list(tmp_path.iterdir()) == []
