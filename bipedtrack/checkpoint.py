@@ -167,43 +167,6 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape).copy()
 
 
-def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Nested dicts of arrays as one dict, the keys joined with `/`: {"a": {"b": x}} gives {"a/b": x}.
-
-    Raises ValueError for what `unflatten` could not give back: an empty dict inside, a key that is no string,
-    is empty or has a `/` in it, a leaf that is no array of numbers.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    for key, value in tree.items():
-        if not isinstance(key, str) or not key or "/" in key:
-            raise ValueError(f"{key!r} cannot be a key: wanted a string without /")
-        if isinstance(value, Mapping):
-            if not value:
-                raise ValueError(f"{key!r} is an empty dict, which has no array to be saved in")
-            arrays |= {f"{key}/{name}": array for name, array in flatten(value).items()}
-        elif isinstance(value, list | tuple) or np.asarray(value).dtype.kind not in _DTYPE_KINDS:
-            raise ValueError(f"{key!r} is a {type(value).__name__}; wanted an array of numbers or a dict")
-        else:
-            arrays[key] = np.asarray(value)
-    return arrays
-
-
-def unflatten(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The nested dicts that `flatten` took apart. Raises ValueError if a name is an array and a dict."""
-    tree: dict[str, Any] = {}
-    for name, array in arrays.items():
-        *parents, last = name.split("/")
-        branch = tree
-        for parent in parents:
-            branch = branch.setdefault(parent, {})
-            if not isinstance(branch, dict):
-                raise ValueError(f"{name!r} lies inside of an array")
-        if last in branch:
-            raise ValueError(f"{name!r} is both an array and a dict")
-        branch[last] = array
-    return tree
-
-
 # Text files
 
 

@@ -261,16 +261,18 @@ class Controller:
         if self._memory is None:
             self._memory = control.initial(self._standing, a_ff)
         if self.uses_feedback and self._tick % self._hold == 0:
-            self._feedback = self.policy.feedback(self.observe(qpos, qvel, command, a_ff))
+            self._feedback = self.policy.feedback(self._observe(qpos, qvel, command, a_ff))
         targets, self._memory = control.joint_targets(self.robot, self.policy.settings, self._memory, a_ff, self._feedback)
         self._tick += 1
         return targets
 
-    def observe(self, qpos: Array, qvel: Array, command: Command, a_ff: Array | None = None) -> np.ndarray:
+    def observe(self, qpos: Array, qvel: Array, command: Command) -> np.ndarray:
         """The flat observation of eq (8), (101,) float32."""
-        qpos, qvel = np.asarray(qpos, np.float32), np.asarray(qvel, np.float32)
         command = _as_float32(command)
-        if a_ff is None:
-            a_ff = control.feedforward(self.robot, self.policy.settings, command.target)
+        return self._observe(qpos, qvel, command, control.feedforward(self.robot, self.policy.settings, command.target))
+
+    def _observe(self, qpos: Array, qvel: Array, command: Command, a_ff: Array) -> np.ndarray:
+        """The same, of a command and its feedforward that are in float32 already."""
+        qpos, qvel = np.asarray(qpos, np.float32), np.asarray(qvel, np.float32)
         real = kinematics.measure(self.robot, qpos)
         return observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, self._feedback))

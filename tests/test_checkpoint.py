@@ -27,10 +27,8 @@ from bipedtrack.checkpoint import (
     RunDirectory,
     RunError,
     append_jsonl,
-    flatten,
     load_arrays,
     save_arrays,
-    unflatten,
     write_json,
 )
 
@@ -336,44 +334,6 @@ from bipedtrack.checkpoint import load_arrays
 print(sorted(load_arrays(sys.argv[1], "policy")[0]))
 """
     assert run_python(code, policy).communicate()[0] == f"{sorted(ARRAYS)}\n"
-
-
-# Trees
-
-keys = st.text(min_size=1, max_size=3).filter(lambda key: "/" not in key)
-leaves = hnp.arrays(np.float32, shapes)
-trees = st.recursive(
-    st.dictionaries(keys, leaves, min_size=1, max_size=3),
-    lambda inner: st.dictionaries(keys, inner | leaves, min_size=1, max_size=3),
-    max_leaves=6,
-)
-
-
-@given(trees)
-def test_a_tree_comes_back_from_its_flat_names(tree):
-    def equal(left, right):
-        if isinstance(left, dict):
-            return list(left) == list(right) and all(equal(left[key], right[key]) for key in left)
-        return left.tobytes() == right.tobytes() and left.shape == right.shape
-
-    assert equal(unflatten(flatten(tree)), tree)
-
-
-def test_flat_names_join_the_keys():
-    assert list(flatten({"a": {"b": np.ones(1), "c": {"d": 2.0}}, "e": np.ones(1)})) == ["a/b", "a/c/d", "e"]
-    assert flatten({}) == unflatten({}) == {}
-
-
-@pytest.mark.parametrize("tree", [{"a": {}}, {"a/b": X}, {"": X}, {1: X}, {"a": [X, X]}, {"a": None}, {"a": {"b": "text"}}])
-def test_a_tree_that_would_not_come_back_is_refused(tree):
-    with pytest.raises(ValueError):
-        flatten(tree)
-
-
-def test_names_that_are_array_and_dict_at_once_are_refused():
-    for names in (["a", "a/b"], ["a/b", "a"], ["a", "a/b/c"]):
-        with pytest.raises(ValueError):
-            unflatten(dict.fromkeys(names, X))
 
 
 # Text files
