@@ -6,11 +6,13 @@ bitwise the same parameters on the same machine; what a call costs to repeat is 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import brax.envs
 import jax
 import numpy as np
 from brax.training.acme import running_statistics, specs
@@ -91,40 +93,63 @@ def _run_call(
         if wants_to_stop():
             raise Stopped
 
-    def wrap(environment: env.TrackingEnv, episode_length: int, **unused: Any) -> autoreset.AutoReset:
-        return autoreset.AutoReset(environment, episode_length)
-
     progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
-    _, params, _ = ppo.train(
-        environment=the_env,
-        wrap_env_fn=wrap,
-        num_timesteps=updates * ppo_config.steps_per_update,
-        num_evals=epochs + 1,
-        run_evals=False,
-        episode_length=config.episode_length,
-        num_envs=ppo_config.num_envs,
-        unroll_length=ppo_config.unroll_length,
-        batch_size=ppo_config.num_envs // ppo_config.num_minibatches,
-        num_minibatches=ppo_config.num_minibatches,
-        num_updates_per_batch=ppo_config.num_epochs,
-        learning_rate=call.learning_rate,
-        entropy_cost=call.entropy_cost,
-        clipping_epsilon=call.clipping_epsilon,
-        discounting=ppo_config.discount,
-        gae_lambda=ppo_config.gae_lambda,
-        max_grad_norm=ppo_config.max_grad_norm,
-        reward_scaling=ppo_config.reward_scaling,
-        normalize_observations=True,
-        normalize_observations_std_eps=network.normalizer_floor,
-        network_factory=functools.partial(make_networks, network),
-        seed=call_seed(seed, call.index),
-        restore_params=params,
-        log_training_metrics=True,
-        training_metrics_steps=5 * ppo_config.steps_per_update,
-        progress_fn=report,
-        policy_params_fn=look,
-    )
+    with _compiled_once():
+        _, params, _ = ppo.train(
+            environment=autoreset.AutoReset(the_env, config.episode_length),
+            wrap_env=False,
+            # never evaluated, yet brax compiles its reset: the cheapest one there is
+            eval_env=brax.envs.get_environment("fast"),
+            num_timesteps=updates * ppo_config.steps_per_update,
+            num_evals=epochs + 1,
+            run_evals=False,
+            episode_length=config.episode_length,
+            num_envs=ppo_config.num_envs,
+            unroll_length=ppo_config.unroll_length,
+            batch_size=ppo_config.num_envs // ppo_config.num_minibatches,
+            num_minibatches=ppo_config.num_minibatches,
+            num_updates_per_batch=ppo_config.num_epochs,
+            learning_rate=call.learning_rate,
+            entropy_cost=call.entropy_cost,
+            clipping_epsilon=call.clipping_epsilon,
+            discounting=ppo_config.discount,
+            gae_lambda=ppo_config.gae_lambda,
+            max_grad_norm=ppo_config.max_grad_norm,
+            reward_scaling=ppo_config.reward_scaling,
+            normalize_observations=True,
+            normalize_observations_std_eps=network.normalizer_floor,
+            network_factory=functools.partial(make_networks, network),
+            seed=call_seed(seed, call.index),
+            restore_params=params,
+            log_training_metrics=True,
+            training_metrics_steps=5 * ppo_config.steps_per_update,
+            progress_fn=report,
+            policy_params_fn=look,
+        )
     return params
+
+
+@contextlib.contextmanager
+def _compiled_once() -> Iterator[None]:
+    """Brax's first training state gets the sharding of all later ones, so that the epoch compiles once and not twice.
+
+    `jax.device_put_replicated`, which brax calls for the first state, differs from `jax.pmap`, whose output the later
+    ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares (brax 0.14.2, jax 0.9.2).
+    """
+
+    def replicate(x: Any, devices: Sequence[Any]) -> Any:
+        axis = ppo._PMAP_AXIS_NAME
+        sharding = jax.sharding.NamedSharding(
+            jax.sharding.Mesh(np.array(devices), (axis,)), jax.sharding.PartitionSpec(axis)
+        )
+        return jax.tree.map(lambda leaf: jax.device_put(jax.numpy.stack([leaf] * len(devices)), sharding), x)
+
+    original = jax.device_put_replicated
+    jax.device_put_replicated = replicate
+    try:
+        yield
+    finally:
+        jax.device_put_replicated = original
 
 
 def make_networks(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> networks.PPONetworks:

@@ -3,12 +3,14 @@
 import dataclasses
 from typing import Any
 
+import brax.envs
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as ppo
 
 from bipedtrack import curriculum, policy, training
 from bipedtrack.checkpoint import CheckpointError
@@ -127,6 +129,30 @@ def test_the_actor_begins_with_the_noise_of_the_curriculum_and_an_unbounded_gaus
 
 
 # Calls
+
+
+def test_brax_compiles_its_epoch_once_and_not_twice(caplog: pytest.LogCaptureFixture) -> None:
+    def compilations(epochs: int) -> int:
+        caplog.clear()
+        with jax.log_compiles():
+            ppo.train(
+                environment=brax.envs.get_environment("fast"),
+                num_timesteps=4 * epochs,
+                num_evals=epochs + 1,
+                run_evals=False,
+                episode_length=4,
+                num_envs=2,
+                unroll_length=2,
+                batch_size=2,
+                num_minibatches=1,
+            )
+        return sum("Finished XLA compilation of jit(_fun)" in record.getMessage() for record in caplog.records)
+
+    once = compilations(1)
+    assert once >= 1
+    with training._compiled_once():
+        assert compilations(3) == once
+    assert compilations(3) == once + 1  # or brax no longer needs our help
 
 
 def test_every_call_of_every_run_has_a_seed_of_its_own() -> None:
