@@ -41,7 +41,7 @@ def loaded(folder: pathlib.Path, text: str) -> Curriculum:
 # The curricula that ship
 
 
-@pytest.mark.parametrize("name", ["quick", "smoke", "paper"])
+@pytest.mark.parametrize("name", ["quick", "smoke", "standard", "paper"])
 def test_a_shipped_curriculum_loads_by_name_and_by_path_and_has_three_stages(name: str) -> None:
     plan = load(name)
     assert plan == load(str(paths.data_dir("curricula") / f"{name}.toml"))
@@ -54,7 +54,7 @@ def test_a_shipped_curriculum_loads_by_name_and_by_path_and_has_three_stages(nam
 
 
 def test_the_default_reward_leaves_no_shipped_curriculum_without_its_terms() -> None:
-    for name in ("quick", "smoke", "paper"):
+    for name in ("quick", "smoke", "standard", "paper"):
         weights = load(name).rewards.weights
         assert min(weights) >= 0 and weights.left_ankle_position == weights.right_ankle_position > 0
     assert load("paper").rewards.weights.feedback_rate == 0  # not one of the paper's terms
