@@ -5,8 +5,6 @@ and with the same joint targets. Rendering may be absent: only videos need it.
 """
 
 import argparse
-import contextlib
-import io
 import os
 import subprocess
 import sys
@@ -15,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from bipedtrack import __version__, versions
+from bipedtrack.messages import quiet_imports
 
 # Whatever may be missing or broken is imported by the check that needs it.
 if TYPE_CHECKING:
@@ -145,7 +144,7 @@ def physics_difference(model: "mujoco.MjModel", keyframe: int) -> tuple[float, f
     import mujoco
     import numpy as np
 
-    with contextlib.redirect_stdout(io.StringIO()):  # on import it reports that its optional warp is absent
+    with quiet_imports():
         from mujoco import mjx
 
     data = mujoco.MjData(model)

@@ -1,7 +1,14 @@
-"""How a command line refuses bad input."""
+"""What a command line says, and what it does not."""
 
+import contextlib
+import io
 import sys
 from typing import NoReturn
+
+
+def quiet_imports() -> contextlib.redirect_stdout[io.StringIO]:
+    """A context for imports: mjx prints in its first one that its optional warp is missing."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 def fail(message: str) -> NoReturn:

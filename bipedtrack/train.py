@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
 import logging
 import pathlib
 import signal
@@ -14,7 +12,7 @@ from typing import Any, Literal
 import tyro
 
 from bipedtrack import checkpoint, config, curriculum, robot, versions
-from bipedtrack.messages import fail
+from bipedtrack.messages import fail, quiet_imports
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
 EVALUATION_DIFFICULTY = 0.5
@@ -102,7 +100,7 @@ def _versions() -> dict[str, str | None]:
 def _train(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed: int, device: str, options: Train) -> None:
     import rich.console
 
-    with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
+    with quiet_imports():
         from bipedtrack import policy, training
     from bipedtrack.progress import Progress
 
