@@ -1,18 +1,19 @@
-"""`python -m bipedtrack.export RUN --out policy.npz`: the policy of a run's last checkpoint as one file for numpy."""
+"""`python -m bipedtrack.export RUN --out policy.npz`: the policy of a run's last checkpoint as one file for numpy.
+
+`--onnx policy.onnx` writes it as an ONNX graph as well, or a policy file as one.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
 import pathlib
 import sys
 from typing import Annotated
 
 import tyro
 
-from bipedtrack import checkpoint, config, curriculum, robot, versions
-from bipedtrack.messages import fail
+from bipedtrack import checkpoint, config, curriculum, onnx_export, policy, robot, versions
+from bipedtrack.messages import fail, quiet_imports
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,9 +21,11 @@ class Export:
     """Writes the policy of a run's newest checkpoint, with all that it needs to run in numpy."""
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
-    """The run directory."""
+    """The run directory; or a policy file, for --onnx."""
     out: pathlib.Path = pathlib.Path("policy.npz")
     """The file to write."""
+    onnx: pathlib.Path | None = None
+    """Also an ONNX graph from observation to feedback, to write here (needs `bipedtrack[onnx]`)."""
 
 
 def main() -> None:
@@ -30,20 +33,32 @@ def main() -> None:
     options = tyro.cli(Export, prog="python -m bipedtrack.export")
     try:
         versions.require()
-        export(options.run, options.out)
+        if options.onnx is not None:
+            onnx_export.require_onnx()
+        if options.run.is_file():
+            if options.onnx is None:
+                raise policy.PolicyError(f"{options.run}: is a file; wanted a run directory, or --onnx with a policy file")
+            written = policy.load(options.run)
+        else:
+            written = export(options.run, options.out)
+            print(options.out)
+        if options.onnx is not None:
+            onnx_export.save(written, options.onnx)
+            print(options.onnx)
     except (
         versions.VersionError,
         config.ConfigError,
         robot.RobotError,
+        policy.PolicyError,
         checkpoint.RunError,
         checkpoint.CheckpointError,
+        onnx_export.OnnxError,
     ) as error:
         fail(str(error))
-    print(options.out)
 
 
-def export(run: pathlib.Path, out: pathlib.Path) -> None:
-    """Writes the policy of the run's newest intact checkpoint.
+def export(run: pathlib.Path, out: pathlib.Path) -> policy.Policy:
+    """Writes the policy of the run's newest intact checkpoint and returns it.
 
     Raises checkpoint.RunError or checkpoint.CheckpointError where the run or its checkpoint cannot be read.
     """
@@ -54,11 +69,13 @@ def export(run: pathlib.Path, out: pathlib.Path) -> None:
         print(f"warning: {warning}", file=sys.stderr)
     if found is None:
         raise checkpoint.CheckpointError(f"{run}: has no checkpoint yet; its first PPO call is not finished")
-    with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
-        from bipedtrack import policy, training
+    with quiet_imports():
+        from bipedtrack import training
 
     index, arrays, _ = found
-    policy.save(training.to_policy(plan, arrays, training.provenance(plan, seed, index + 1)), out)
+    newest = training.to_policy(plan, arrays, training.provenance(plan, seed, index + 1))
+    policy.save(newest, out)
+    return newest
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
 
     Normaliser, network, feedback scale and clip are inside; `metadata` is attached. Raises OnnxError.
     """
-    _require_onnx()
+    require_onnx()
     from onnx import TensorProto, checker, helper, numpy_helper
 
     nodes: list[onnx.NodeProto] = []
@@ -117,7 +117,8 @@ def save(policy: Policy, path: str | pathlib.Path) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _require_onnx() -> None:
+def require_onnx() -> None:
+    """Raises OnnxError where the package onnx is missing."""
     try:
         importlib.import_module("onnx")
     except ImportError:

@@ -92,13 +92,15 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
     """A policy from its file, every byte and every name checked.
 
     Args:
-      path: the file.
+      path: the file, or a run directory, which stands for its policy.npz.
       robot: the robot it is going to drive; a policy of another one is refused.
 
     Raises:
       checkpoint.CheckpointError: the file is missing, cut off, changed or no policy.
       PolicyError: the file is intact but of another observation layout, robot or shape.
     """
+    path = pathlib.Path(path)
+    path = path / "policy.npz" if path.is_dir() else path
     arrays, meta = checkpoint.load_arrays(path, KIND)
     try:
         if meta["observation"]["hash"] != observation.layout_hash():

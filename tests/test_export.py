@@ -12,6 +12,7 @@ import sys
 
 import jax
 import numpy as np
+import onnxruntime
 import pytest
 
 import bipedtrack
@@ -122,6 +123,29 @@ def test_the_file_holds_all_that_acts_between_command_and_joint_targets(exported
         np.testing.assert_array_equal(getattr(loaded.robot, name), wanted)
     controller = policy.Controller(loaded)
     controller.reset(np.zeros(19))
+
+
+def test_onnx_is_written_beside_the_policy_and_from_a_policy_file(exported, tmp_path, monkeypatch, capsys):
+    run, _, policy_file = exported
+    graphs = []
+    for source in (run, policy_file):
+        graphs.append(tmp_path / f"{source.name}.onnx")
+        arguments = [str(source), "--out", str(tmp_path / "again.npz"), "--onnx", str(graphs[-1])]
+        monkeypatch.setattr(sys, "argv", ["bipedtrack.export", *arguments])
+        export.main()
+        assert capsys.readouterr().out.splitlines()[-1] == str(graphs[-1])
+    assert graphs[0].read_bytes() == graphs[1].read_bytes()
+    assert (tmp_path / "again.npz").read_bytes() == policy_file.read_bytes()
+    observations = np.random.default_rng(5).normal(scale=0.1, size=(50, observation.SIZE)).astype(np.float32)
+    (feedback,) = onnxruntime.InferenceSession(graphs[0]).run(None, {"observation": observations})
+    wanted = policy.load(policy_file).feedback(observations)
+    assert np.std(wanted) > 0.01
+    np.testing.assert_allclose(feedback, wanted, atol=1e-5)
+
+
+def test_a_policy_file_has_nothing_to_export_but_onnx(exported, refused, tmp_path):
+    assert "is a file; wanted a run directory, or --onnx" in refused(exported[2])
+    assert "cannot be written" in refused(exported[2], "--onnx", tmp_path / "missing" / "policy.onnx")
 
 
 def test_the_provenance_names_curriculum_seed_steps_and_versions(exported):
