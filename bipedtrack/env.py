@@ -215,7 +215,8 @@ class TrackingEnv(brax.envs.Env):
 
     def control_step(self, physics: Physics, episode: Episode, a_fb: Array) -> tuple[tuple[Physics, Episode], Answer]:
         """One control step of 0.005 s with a feedback (12,): eqs (4)-(7), physics, clock."""
-        a_ff = control.feedforward(self.robot, self.config.control, self.command(episode).target)
+        wanted = self.feedforward_nodes(episode, self.command(episode))
+        a_ff = control.feedforward(self.robot, self.config.control, wanted)
         targets, memory = control.joint_targets(self.robot, self.config.control, episode.control, a_ff, a_fb)
         physics = self._simulate(physics, targets)
         episode = self._tick(episode._replace(control=memory))
@@ -254,6 +255,10 @@ class TrackingEnv(brax.envs.Env):
         """The command at this instant."""
         return planner.command(episode.step, episode.tick * self.robot.timestep)
 
+    def feedforward_nodes(self, episode: Episode, command: planner.Command) -> nodes.Nodes:
+        """The nodes that inverse kinematics turns into the feedforward: the real-time target."""
+        return command.target
+
     def _boxes(self, given: Any, task: Any, index: Array) -> Array:
         if not self.mj_model.nmocap:
             return jnp.zeros((0, 7))
@@ -261,7 +266,7 @@ class TrackingEnv(brax.envs.Env):
 
     def observe(self, physics: Physics, episode: Episode, command: planner.Command) -> Array:
         """The flat observation of eq (8), (101,)."""
-        a_ff = control.feedforward(self.robot, self.config.control, command.target)
+        a_ff = control.feedforward(self.robot, self.config.control, self.feedforward_nodes(episode, command))
         real = kinematics.measure(self.robot, physics.qpos)
         return observation.flatten(observation.observe(command, real, physics.qpos, physics.qvel, a_ff, episode.feedback))
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
 import pathlib
 import time
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,7 +11,7 @@ import numpy as np
 import tyro
 
 from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, tasks, trace, versions
-from bipedtrack.messages import fail
+from bipedtrack.messages import fail, quiet_imports
 
 if TYPE_CHECKING:
     from bipedtrack import suite
@@ -37,7 +35,7 @@ class Evaluate:
     episodes: int = 256
     """Of each task."""
     seconds: float = 10.0
-    """Of each episode; scripts last as long as they take."""
+    """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
     engine: Literal["mjx", "mujoco", "both"] = "both"
     """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one."""
     seed: int = SEED
@@ -53,7 +51,7 @@ class Evaluate:
     velocity_feedforward: bool | None = None
     """With or without (kd/kp) dq/dt."""
     feedforward: bool = True
-    """--no-feedforward: the feedforward stays at the first command's (MuJoCo C only)."""
+    """--no-feedforward: the feedforward stays at the first command's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,8 +80,7 @@ def subject(name: str, options: Evaluate) -> Subject:
         the_robot, settings, period = robot.load(), control.ControlConfig(level_feet=True), 0.02
         network, activation, provenance = None, "swish", {}
     else:
-        path = pathlib.Path(name)
-        loaded = policy.load(path / "policy.npz" if path.is_dir() else path, robot.load())
+        loaded = policy.load(name, robot.load())
         the_robot, settings, period = loaded.robot, loaded.settings, loaded.policy_period
         network, activation, provenance = loaded.network, loaded.activation, loaded.provenance
     if options.filter is not None:
@@ -102,7 +99,8 @@ class Engines:
 
     def __init__(self, who: Subject, engine: str):
         """engine: mjx, mujoco or both."""
-        from bipedtrack import recording
+        with quiet_imports():
+            from bipedtrack import recording
 
         self._who = who
         self.names = [n for n in ENGINES if engine == "both" or (n == "mjx") == (engine == "mjx")]
@@ -127,7 +125,8 @@ class Engines:
 
         settings = env.EnvConfig(rewards.RewardConfig(), self._who.settings, self._who.policy_period)
         first = jax.tree.map(lambda leaf: leaf[0], batch.plan)
-        the_env = env.TrackingEnv(self._who.robot, settings, first, plans.PLANNED, batch.sizes, touch=True)
+        of_kind = env.TrackingEnv if self._who.feedforward else recording.FirstCommandEnv
+        the_env = of_kind(self._who.robot, settings, first, plans.PLANNED, batch.sizes, touch=True)
         return recording.mjx_recorder(the_env, self._who.act)
 
 
@@ -173,6 +172,9 @@ def run(options: Evaluate) -> dict[str, Any]:
                 course = metrics.time_course(recorded)
                 results[engine] = {"summary": summary, "course": {k: _thin(v) for k, v in course.items()}}
                 results[engine]["path"] = _path(recorded.episode(0))
+                results[engine]["levels"] = [
+                    {"label": level.label, **metrics.outline(recorded.episode(level.episodes))} for level in batch.levels
+                ]
                 if engine != "converged":
                     for episode in range(min(_TRACES, len(recorded.alive))):
                         file = options.out / "traces" / f"{stem}-{engine}-{name}-{episode}.npz"
@@ -184,10 +186,11 @@ def run(options: Evaluate) -> dict[str, Any]:
 
 
 def _tasks(options: Evaluate) -> tuple[str, ...]:
-    """The names of the tasks. Raises ConfigError for an unknown one."""
+    """The names of the tasks. Raises ConfigError for an unknown one and footsteps.ScriptError for a bad script."""
     from bipedtrack import suite
 
     if options.script is not None:
+        footsteps.load(options.script, robot.load())  # refused before anything is written
         return (options.script.stem,)
     for name in options.tasks:
         if name not in suite.TASKS:
@@ -204,12 +207,18 @@ def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.
         script = footsteps.load(path, the_robot)
         # a script is the same every time: more episodes would tell nothing
         return suite.script_batch(script, 1), footsteps.duration(script)
-    return suite.batch(name, tasks.Ranges(), the_robot, options.episodes, options.seconds, options.seed), options.seconds
+    seconds = suite.duration(name, tasks.Ranges(), options.seconds)
+    return suite.batch(name, tasks.Ranges(), the_robot, options.episodes, seconds, options.seed), seconds
+
+
+def _every(count: int) -> slice:
+    """Which of so many values make a curve of about 200 points: every tenth of 10 s."""
+    return slice(None, None, max(10, count // 200))
 
 
 def _thin(values: np.ndarray) -> list[float | None]:
-    """Every tenth value, for curves that are drawn a few hundred points wide."""
-    return [None if not np.isfinite(v) else round(float(v), 4) for v in values[::10]]
+    """The values of a curve, to four digits."""
+    return [None if not np.isfinite(v) else round(float(v), 4) for v in values[_every(len(values))]]
 
 
 def _boxes_of_first(boxes: metrics.Boxes) -> list[list[float]]:
@@ -218,12 +227,12 @@ def _boxes_of_first(boxes: metrics.Boxes) -> list[list[float]]:
 
 
 def _path(recorded: trace.Trace) -> dict[str, Any]:
-    """Where the nodes of one episode were meant to be and were, until its fall: x, y, z in m, every tenth control step."""
+    """Where the nodes of one episode were meant to be and were, until its fall: x, y, z in m, as curves."""
     up = int(recorded.alive.sum())
     found: dict[str, Any] = {"time_s": _thin(recorded.time[:up])}
     for side, state in (("target", recorded.target), ("measured", recorded.measured)):
         points = {"trunk": state.trunk_position, **{leg: state.ankle_positions[:, i] for i, leg in enumerate(robot.LEGS)}}
-        found[side] = {node: np.round(at[:up:10], 4).tolist() for node, at in points.items()}
+        found[side] = {node: np.round(at[:up][_every(up)], 4).tolist() for node, at in points.items()}
     return found
 
 
@@ -267,12 +276,10 @@ def main() -> None:
     try:
         versions.require()
         _check(options)
-        with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that its optional warp is missing
-            from bipedtrack import recording  # noqa: F401
         record = run(options)
-        from bipedtrack import report
+        from bipedtrack import report, verdicts
 
-        record["verdicts"] = report.verdicts(record)
+        record["verdicts"] = verdicts.verdicts(record)
         checkpoint.write_json(options.out / "metrics.json", record)
         page = options.out / "report.html"
         checkpoint.write_text(page, report.page(record))
@@ -291,8 +298,6 @@ def _check(options: Evaluate) -> None:
         raise config.ConfigError(f"--seconds {options.seconds}: must lie in [0.1, 600]")
     if options.feedback_ratio is not None and not 0 <= options.feedback_ratio <= 2:
         raise config.ConfigError(f"--feedback-ratio {options.feedback_ratio}: must lie in [0, 2]")
-    if (not options.feedforward or "zero" in options.policies) and options.engine != "mujoco":
-        raise config.ConfigError("--no-feedforward and the policy zero run in MuJoCo C only: add --engine mujoco")
 
 
 if __name__ == "__main__":

@@ -101,16 +101,23 @@ def summarise(
       ValueError: a trace without an axis of episodes or two entries, not alive at first, or again after a fall, or not
         finite before it.
     """
+    return {
+        **outline(trace),
+        "seconds": float(len(trace.time) * trace.timestep),
+        "touchdown": _summarise_touchdowns(trace, contact_share * weight),
+        "clearance": None if boxes is None else _summarise_clearances(trace, robot, boxes),
+        "rest": rest(trace, settle),
+        "effort": effort(trace, robot.torque_limit),
+    }
+
+
+def outline(trace: Trace) -> dict[str, Any]:
+    """What `summarise` says of episodes, errors and survival. Raises ValueError as it does."""
     _check(trace)
     return {
         "episodes": len(trace.alive),
-        "seconds": float(len(trace.time) * trace.timestep),
         "errors": {name: _statistics(v.ravel()) | _interval(np.nanmean(v, axis=1)) for name, v in errors(trace).items()},
-        "touchdown": _summarise_touchdowns(trace, contact_share * weight),
-        "clearance": None if boxes is None else _summarise_clearances(trace, robot, boxes),
         "survival": survival(trace),
-        "rest": rest(trace, settle),
-        "effort": effort(trace, robot.torque_limit),
     }
 
 

@@ -19,7 +19,7 @@ from bipedtrack.rotations import Array
 from bipedtrack.trace import Trace
 
 Act = Callable[[Array], Array]  # the network's output (12,) for an observation (101,), in jax.numpy
-_CHUNK = 50  # policy steps between two looks at who is still up
+_CHUNK = 50  # policy steps between two looks at whether anybody is still up
 
 
 class _Sample(NamedTuple):
@@ -34,6 +34,14 @@ class _Sample(NamedTuple):
     joint_targets: Array
     foot_forces: Array
     alive: Array
+
+
+class FirstCommandEnv(env.TrackingEnv):
+    """A planned environment without feedforward: it stays at the episode's first command."""
+
+    def feedforward_nodes(self, episode: env.Episode, command: planner.Command) -> Nodes:
+        """Where the episode began."""
+        return jax.tree.map(lambda leaf: leaf[0], episode.given.steps.start)
 
 
 def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, float], Trace]:
@@ -72,15 +80,16 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
     begin = jax.jit(jax.vmap(the_env.begin))
 
     def record(batch: plans.Plan, seconds: float) -> Trace:
-        robots, policy_steps = batch.boxes.shape[0], round(seconds / the_env.config.policy_period)
+        robots, ticks = batch.boxes.shape[0], round(seconds / the_env.robot.timestep)
         state = begin(jax.random.split(jax.random.PRNGKey(0), robots), batch)
         carry = (state, jnp.ones(robots, bool))
         chunks = []
-        for _ in range(-(-policy_steps // _CHUNK)):
+        for _ in range(-(-ticks // (_CHUNK * the_env.substeps))):
             carry, samples = advance(carry)
             chunks.append(jax.tree.map(lambda a: np.asarray(a).reshape(robots, -1, *a.shape[3:]), samples))
-        ticks = policy_steps * the_env.substeps
-        samples = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :ticks], *chunks)
+            if not np.asarray(carry[1]).any():
+                break
+        samples = jax.tree.map(lambda *parts: _of_length(np.concatenate(parts, axis=1), ticks), *chunks)
         return _complete(the_env.robot, samples)
 
     return record
@@ -191,7 +200,9 @@ def in_mujoco(
             part = (target, timer, still, memory.feedback)
             target, timer, still, feedback = jax.tree.map(np.asarray, part)
             samples.append(_Sample(qpos, qvel, target, timer, still, feedback, wanted, forces, alive))
-    stacked = jax.tree.map(lambda *parts: np.stack(parts, axis=1), *samples)
+            if not alive.any():
+                break
+    stacked = jax.tree.map(lambda *parts: _of_length(np.stack(parts, axis=1), ticks), *samples)
     return _complete(the_robot, stacked)
 
 
@@ -205,6 +216,12 @@ def _upright(qpos: Array, qvel: Array) -> Array:
     """Whether a robot's state is finite and its trunk tilted by less than 60 deg; leading axes of 19 and 18."""
     finite = (abs(qpos) < 1e6).all(axis=0) & (abs(qvel) < 1e6).all(axis=0)
     return finite & (1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2) > 0.5)
+
+
+def _of_length(entries: np.ndarray, ticks: int) -> np.ndarray:
+    """Entries (e, n, ...) cut to n = ticks, or filled up with the last one: what follows when everybody has fallen."""
+    missing = ticks - entries.shape[1]
+    return entries[:, :ticks] if missing <= 0 else np.concatenate([entries, entries[:, -1:].repeat(missing, axis=1)], axis=1)
 
 
 def _complete(the_robot: robot.Robot, samples: _Sample) -> Trace:

@@ -19,6 +19,14 @@ from bipedtrack import footsteps, paths, plans, robot, tasks, terrain
 RISERS = (0.05, 0.08, 0.11, 0.14, 0.17)  # m
 TREADS = (0.25, 0.30, 0.35)  # m
 HOLD_AFTER = (1, 8)  # task steps before a hold
+LONG_HOLD = 60.0  # s
+
+
+class Level(NamedTuple):
+    """The episodes of one difficulty."""
+
+    label: str
+    episodes: np.ndarray  # (k,) indices
 
 
 class Batch(NamedTuple):
@@ -27,6 +35,7 @@ class Batch(NamedTuple):
     plan: plans.Plan  # leading axis: episodes
     sizes: tuple[tuple[float, float, float], ...]  # of the plan's boxes: length, width, height, m
     ranges: str  # what the episodes are drawn from, in words
+    levels: tuple[Level, ...] = ()  # the episodes from easy to hard
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +61,9 @@ _RANDOM = {
 }
 SCRIPTS = ("obstacles", "composite")
 MOVING = tuple(name for name in _RANDOM if name != "stand")
-TASKS = (*_RANDOM, *(f"hold-{name}" for name in MOVING), *SCRIPTS)
+HOLDS = tuple(f"hold-{name}" for name in MOVING)
+LONG_HOLDS = tuple(f"hold-60s-{name}" for name in MOVING)
+TASKS = (*_RANDOM, *HOLDS, *LONG_HOLDS, *SCRIPTS)
 
 
 def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int, seconds: float, seed: int) -> Batch:
@@ -68,8 +79,7 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
     """
     if name in SCRIPTS:
         return script_batch(footsteps.load(script_path(name), the_robot), episodes)
-    hold = name.startswith("hold-")
-    what = _RANDOM[name.removeprefix("hold-")]
+    hold, what = name.startswith("hold-"), _what(name)
     steps = int(np.ceil(seconds / ranges.period[0])) + 1
     key = jax.random.fold_in(jax.random.PRNGKey(seed), TASKS.index(name))
     given = [_distribution(ranges, what, hold, i) for i in range(episodes)]
@@ -80,7 +90,45 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
     if what.kind == "stairs":
         narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
-    return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words)
+    levels = _grid(episodes) if what.kind == "stairs" else _thirds(what.kind, plan)
+    return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words, levels)
+
+
+def duration(name: str, ranges: tasks.Ranges, seconds: float) -> float:
+    """How long an episode of a random task lasts, s: a hold lasts that long, or 60 s, after the steps before it."""
+    if not name.startswith("hold-"):
+        return seconds
+    longest = (ranges.squat_period if _what(name).kind == "squat" else ranges.period)[2]
+    return HOLD_AFTER[1] * longest + (LONG_HOLD if name in LONG_HOLDS else seconds)
+
+
+def _what(name: str) -> _Random:
+    return _RANDOM[name.removeprefix("hold-").removeprefix("60s-")]
+
+
+def _grid(episodes: int) -> tuple[Level, ...]:
+    """The cells of risers and treads, the lowest riser first."""
+    found = []
+    for r, riser in enumerate(RISERS):
+        for t, tread in enumerate(TREADS):
+            mine = np.arange(t * len(RISERS) + r, episodes, len(RISERS) * len(TREADS))
+            found.append(Level(f"riser {riser:.2f} m, tread {tread:.2f} m", mine))
+    return tuple(level for level in found if len(level.episodes))
+
+
+def _thirds(kind: str, plan: plans.Plan) -> tuple[Level, ...]:
+    """Three levels of as many episodes each, by how far the swing foot goes, or turns; none where no foot moves."""
+    swing = plan.steps.swing > 0
+    if not swing.any():
+        return ()
+    start, end = plan.steps.start, plan.steps.end
+    if kind == "turn":
+        way, unit = np.degrees(np.abs(end.ankle_yaws - start.ankle_yaws)), "deg"
+    else:
+        way, unit = 100 * np.linalg.norm(end.ankle_positions - start.ankle_positions, axis=-1), "cm"
+    mean = (way * swing).sum(axis=(1, 2)) / swing.sum(axis=(1, 2))
+    parts = [part for part in np.array_split(np.argsort(mean, kind="stable"), 3) if len(part)]
+    return tuple(Level(f"{mean[part[0]]:.0f}-{mean[part[-1]]:.0f} {unit} a step", np.sort(part)) for part in parts)
 
 
 def script_path(name: str) -> pathlib.Path:

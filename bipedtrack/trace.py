@@ -35,12 +35,12 @@ class Trace(NamedTuple):
         """The control period, s."""
         return float(self.time[1] - self.time[0])
 
-    def episode(self, index: int) -> Trace:
-        """The trace of one of several robots."""
+    def episode(self, index: int | np.ndarray) -> Trace:
+        """The trace of one of several robots, or of several at indices (k,)."""
         return Trace(self.time, *(_pick(part, index) for part in self[1:]))
 
 
-def _pick(part: Any, index: int) -> Any:
+def _pick(part: Any, index: int | np.ndarray) -> Any:
     return Nodes(*(array[index] for array in part)) if isinstance(part, Nodes) else part[index]
 
 

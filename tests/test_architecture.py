@@ -14,12 +14,12 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 
 # A module may import those before it: on a line above, or further left on its own.
 LADDER = """
-    versions paths messages
+    versions paths messages record drawing
     config checkpoint
     rotations robot
     nodes kinematics trace
     planner terrain
-    tasks footsteps plans disturbances control observation rewards metrics
+    tasks footsteps plans disturbances control observation rewards metrics verdicts charts
     policy onnx_export env autoreset
     curriculum rollout progress recording suite
     training evaluation report
