@@ -1,6 +1,7 @@
 """Films of what was recorded: the robot, green traces of its targets, yellow ones of itself, prints where feet shall go.
 
 python -m bipedtrack.video policy.npz --script walk.csv --out walk.mp4
+python -m bipedtrack.video policy.npz --task stairs-up --out stairs.mp4
 
 Everything is rendered without a screen. The suffix decides: .mp4 (H.264) and .gif are films, .png is a strip of pictures.
 """
@@ -17,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -388,16 +389,20 @@ def _write_strip(path: pathlib.Path, frames: Iterator[np.ndarray]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Video:
-    """Films the robot in MuJoCo C on its way through a footstep script, without a screen."""
+    """Films the robot in MuJoCo C at a task of the evaluation or on its way through a footstep script, without a screen."""
 
     policy: Annotated[pathlib.Path, tyro.conf.Positional]
-    """A policy file."""
-    script: pathlib.Path
-    """A footstep script, CSV."""
+    """A policy file or a run directory."""
     out: pathlib.Path
     """The file to write: .mp4, .gif, or .png for a strip of six pictures."""
+    task: str | None = None
+    """A task of the evaluation, such as walk-forward."""
+    episode: int = 0
+    """Which of the task's episodes; the evaluation has the same ones."""
+    script: pathlib.Path | None = None
+    """A footstep script, CSV, instead of a task."""
     seconds: float | None = None
-    """How long; the script's end is held. Default: as long as the script takes."""
+    """How long; a script's end is held. Default: as long as the script takes, or the task's 10 s."""
     feedback: bool = True
     """--no-feedback: inverse kinematics alone."""
     size: tuple[int, int] = (640, 480)
@@ -414,21 +419,52 @@ def main() -> None:
         _check(options)
         require_writable(options.out, options.size)
         choose_backend()
-        the_robot = robot.load()
-        controller = policy.Controller(policy.load(options.policy, the_robot), options.feedback)
-        script = footsteps.load(options.script, the_robot)
-        recorded = simulate.record(controller, script, options.seconds)
+        driven = policy.load(options.policy, robot.load())
+        recorded, boxes, sizes = _record_script(options, driven) if options.script else _record_task(options, driven)
         print(simulate.summary(recorded))
-        model = robot.build_model(the_robot.name, [box.size for box in script.boxes])
-        boxes = np.array([[*box.position, *box.orientation] for box in script.boxes]).reshape(-1, 7)
-        count = film(model, the_robot, recorded, options.out, boxes, options.size, options.fps)
+        model = robot.build_model(driven.robot.name, sizes)
+        count = film(model, driven.robot, recorded, options.out, boxes, options.size, options.fps)
     except (ValueError, RuntimeError, OSError) as error:
         fail(str(error))
     print(f"{options.out}: {count} pictures in {time.monotonic() - began:.0f} s")
 
 
+_Recorded = tuple[Trace, np.ndarray, Sequence[Sequence[float]]]  # the trace, the poses of its boxes and their sizes
+
+
+def _record_script(options: Video, driven: policy.Policy) -> _Recorded:
+    assert options.script is not None
+    script = footsteps.load(options.script, driven.robot)
+    recorded = simulate.record(policy.Controller(driven, options.feedback), script, options.seconds)
+    boxes = np.array([[*box.position, *box.orientation] for box in script.boxes]).reshape(-1, 7)
+    return recorded, boxes, [box.size for box in script.boxes]
+
+
+def _record_task(options: Video, driven: policy.Policy) -> _Recorded:
+    """An episode just as the evaluation has it."""
+    import jax
+
+    from bipedtrack import evaluate, plans, suite, tasks
+
+    if options.task not in suite.TASKS:
+        raise ValueError(f"--task {options.task}: no such task; there are: {', '.join(suite.TASKS)}")
+    asked = evaluate.Evaluate((str(options.policy),), feedback_ratio=None if options.feedback else 0.0)
+    seconds = suite.duration(options.task, tasks.Ranges(), options.seconds or asked.seconds)
+    batch = suite.batch(options.task, tasks.Ranges(), driven.robot, options.episode + 1, seconds, asked.seed)
+    batch = batch._replace(plan=jax.tree.map(lambda leaf: leaf[-1:], batch.plan))
+    engines = evaluate.Engines(evaluate.subject(asked.policies[0], asked), "mujoco")
+    recorded = engines.record("mujoco", batch, seconds).episode(0)
+    plan = jax.tree.map(lambda leaf: leaf[0], batch.plan)
+    numbers, _ = plans.step_numbers(plan, recorded.timestep, len(recorded.time))
+    return recorded, plan.boxes[numbers], batch.sizes
+
+
 def _check(options: Video) -> None:
-    """Raises ValueError for numbers that make no film."""
+    """Raises ValueError for options that make no film."""
+    if (options.task is None) == (options.script is None):
+        raise ValueError("name what to film: either --task or --script")
+    if not 0 <= options.episode < 10_000:
+        raise ValueError(f"--episode {options.episode}: must be from 0 to 9999")
     if options.seconds is not None and not 0.1 <= options.seconds < 1e5:
         raise ValueError(f"--seconds {options.seconds}: must be at least 0.1 and less than 100000")
     if not all(16 <= side <= 4096 for side in options.size):

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bipedtrack import control, doctor, footsteps, kinematics, observation, policy, video
+from bipedtrack import control, doctor, evaluate, footsteps, kinematics, observation, policy, suite, tasks, video
 from bipedtrack import robot as robots
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.planner import Command
@@ -384,8 +384,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(inputs: Path, *arguments: str, backend: str | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "bipedtrack.video", "policy.npz", "--script", "walk.csv", *arguments]
+def run(
+    inputs: Path, *arguments: str, what: str = "--script walk.csv", backend: str | None = None
+) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "bipedtrack.video", "policy.npz", *what.split(), *arguments]
     environment = os.environ | {"PYTHONPATH": str(ROOT)} | ({"MUJOCO_GL": backend} if backend else {})
     return subprocess.run(command, cwd=inputs, env=environment, capture_output=True, text=True, timeout=120)
 
@@ -398,6 +400,32 @@ def test_command_line_films_a_script(inputs: Path, tmp_path: Path) -> None:
     assert "mean error" in found.stdout and f"{out}: 4 pictures" in found.stdout
     with Image.open(out) as gif:
         assert gif.size == (64, 48) and gif.n_frames == 4
+
+
+@pytest.mark.usefixtures("rendered")
+def test_command_line_films_the_evaluations_own_episode(inputs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "stairs.png"
+    found = run(inputs, "--out", str(out), "--seconds", "0.2", "--size", "64", "48", what="--task stairs-up --episode 4")
+    assert found.returncode == 0 and found.stdout.startswith("0.2 s, no fall; mean error: ankles "), found.stderr
+    # the fifth cell of the grid has the highest riser, and the evaluation's trace starts where the film does
+    batch = suite.batch("stairs-up", tasks.Ranges(), robots.load(), 5, 0.2, evaluate.SEED)
+    assert batch.plan.steps.end.ankle_positions[4, 0, :, 2].max() == pytest.approx(0.04 + 0.17)
+    with Image.open(out) as strip:
+        assert strip.size == (6 * 30, 48)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("--task fly", "--task fly: no such task; there are: stand, squat"),
+        ("--task stand --script walk.csv", "name what to film: either --task or --script"),
+        ("", "name what to film: either --task or --script"),
+        ("--task stand --episode -1", "--episode -1: must be from 0 to 9999"),
+    ],
+)
+@pytest.mark.usefixtures("rendered")
+def test_what_cannot_be_filmed_is_refused_in_one_line(inputs: Path, what: str, message: str) -> None:
+    check_refusal(run(inputs, "--out", "walk.gif", what=what), message)
 
 
 @pytest.mark.parametrize(
