@@ -1,6 +1,6 @@
 """What may go otherwise than in the model: pushes, payload, friction, motors, delay, noise and masses, for recordings in C.
 
-Each kind is a ladder of levels; a level is the hooks that `recording.in_mujoco` calls. Episode i of a level is disturbed the
+Each kind is a ladder of levels; a level is the hooks of a `recording.mujoco_recorder`. Episode i of a level is disturbed the
 same way for every policy.
 """
 
@@ -18,7 +18,7 @@ NOISE = {"joint angles": 0.01, "trunk tilt": 0.01, "trunk velocity": 0.05, "angu
 
 
 class Hooks(NamedTuple):
-    """Arguments of `recording.in_mujoco`."""
+    """Arguments of a `recording.mujoco_recorder`."""
 
     model_of: Callable[[Any, int], Any] | None = None
     before_step: Callable[[int, Sequence[Any], np.ndarray], np.ndarray] | None = None
@@ -49,7 +49,7 @@ def push(impulse: float, timestep: float) -> Hooks:
 
 
 def payload(mass: float, timestep: float) -> Hooks:
-    """A mass, kg, fixed at the trunk's centre."""
+    """A mass, kg, about the trunk's centre, spread like the trunk's own."""
 
     def model_of(model: Any, episode: int) -> Any:
         trunk = model.body("trunk")

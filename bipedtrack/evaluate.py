@@ -104,16 +104,14 @@ class Engines:
 
         self._who = who
         self.names = [n for n in ENGINES if engine == "both" or (n == "mjx") == (engine == "mjx")]
-        self._controls = recording.Controls(who.robot, who.settings, who.policy_period, who.act, who.feedforward)
+        controls = recording.Controls(who.robot, who.settings, who.policy_period, who.act, who.feedforward)
+        self._mujoco = recording.mujoco_recorder(controls)
         self._mjx: dict[Any, Any] = {}
 
     def record(self, name: str, batch: suite.Batch, seconds: float, **hooks: Any) -> trace.Trace:
         """The trace of a batch in one engine."""
-        from bipedtrack import recording
-
         if name != "mjx":
-            converged = name == "converged"
-            return recording.in_mujoco(self._controls, batch.plan, batch.sizes, seconds, converged, **hooks)
+            return self._mujoco(batch.plan, batch.sizes, seconds, name == "converged", **hooks)
         if batch.sizes not in self._mjx:
             self._mjx[batch.sizes] = self._compile(batch)
         return self._mjx[batch.sizes](batch.plan, seconds)
@@ -170,11 +168,9 @@ def run(options: Evaluate) -> dict[str, Any]:
                 recorded = engines.record(engine, batch, seconds)
                 summary = metrics.summarise(recorded, one.robot, weight, boxes)
                 course = metrics.time_course(recorded)
-                results[engine] = {"summary": summary, "course": {k: _thin(v) for k, v in course.items()}}
+                results[engine] = {"summary": _rounded(summary), "course": {k: _thin(v) for k, v in course.items()}}
                 results[engine]["path"] = _path(recorded.episode(0))
-                results[engine]["levels"] = [
-                    {"label": level.label, **metrics.outline(recorded.episode(level.episodes))} for level in batch.levels
-                ]
+                results[engine]["levels"] = [_level(level, recorded) for level in batch.levels]
                 if engine != "converged":
                     for episode in range(min(_TRACES, len(recorded.alive))):
                         file = options.out / "traces" / f"{stem}-{engine}-{name}-{episode}.npz"
@@ -209,6 +205,20 @@ def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.
         return suite.script_batch(script, 1), footsteps.duration(script)
     seconds = suite.duration(name, tasks.Ranges(), options.seconds)
     return suite.batch(name, tasks.Ranges(), the_robot, options.episodes, seconds, options.seed), seconds
+
+
+def _level(level: suite.Level, recorded: trace.Trace) -> dict[str, Any]:
+    """How the episodes of one difficulty went."""
+    outline = metrics.outline(recorded.episode(level.episodes))
+    outline["errors"] = {name: {k: of[k] for k in ("mean", "p95")} for name, of in outline["errors"].items()}
+    return {"label": level.label, **_rounded(outline)}
+
+
+def _rounded(tree: Any) -> Any:
+    """The same with every float to five digits: more would tell nothing."""
+    if isinstance(tree, dict):
+        return {key: _rounded(value) for key, value in tree.items()}
+    return float(f"{tree:.5g}") if isinstance(tree, float) else tree
 
 
 def _every(count: int) -> slice:
@@ -270,6 +280,13 @@ def line(who: str, task: str, engine: str, summary: dict[str, Any]) -> str:
     )
 
 
+def _without_curves(tree: Any) -> Any:
+    """The figures of a record alone: curves stand in the report, and in full in the traces."""
+    if not isinstance(tree, dict):
+        return tree
+    return {key: _without_curves(value) for key, value in tree.items() if key not in ("course", "path")}
+
+
 def main() -> None:
     """The command line. Exit status 0 when evaluated, 2 for bad input."""
     options = tyro.cli(Evaluate, prog="python -m bipedtrack.evaluate")
@@ -280,7 +297,7 @@ def main() -> None:
         from bipedtrack import report, verdicts
 
         record["verdicts"] = verdicts.verdicts(record)
-        checkpoint.write_json(options.out / "metrics.json", record)
+        checkpoint.write_json(options.out / "metrics.json", _without_curves(record))
         page = options.out / "report.html"
         checkpoint.write_text(page, report.page(record))
         print(page)

@@ -1,4 +1,4 @@
-"""Reads the record of an evaluation: what `evaluate.run` returns, or metrics.json holds. What is missing there is None."""
+"""Reads the record of an evaluation, or what metrics.json holds of it. What is missing there is None."""
 
 from __future__ import annotations
 

@@ -78,6 +78,7 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
         return jax.vmap(one)(*carry)
 
     begin = jax.jit(jax.vmap(the_env.begin))
+    measure = _measure(the_env.robot)
 
     def record(batch: plans.Plan, seconds: float) -> Trace:
         robots, ticks = batch.boxes.shape[0], round(seconds / the_env.robot.timestep)
@@ -90,7 +91,7 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
             if not np.asarray(carry[1]).any():
                 break
         samples = jax.tree.map(lambda *parts: _of_length(np.concatenate(parts, axis=1), ticks), *chunks)
-        return _complete(the_env.robot, samples)
+        return _complete(the_env.robot, samples, measure)
 
     return record
 
@@ -112,45 +113,24 @@ class Controls(NamedTuple):
     feedforward: bool = True  # False: it stays at the first command's
 
 
-def in_mujoco(
-    controls: Controls,
-    batch: plans.Plan,
-    sizes: Sequence[Sequence[float]],
-    seconds: float,
-    converged: bool = False,
-    model_of: Callable[[Any, int], Any] | None = None,
-    before_step: Callable[[int, Sequence[Any], np.ndarray], np.ndarray] | None = None,
-    observed: Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
-) -> Trace:
-    """Episodes of a batch of plans (leading axis e) in MuJoCo C, stepped on all cores.
+def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
+    """A function (batch, sizes, seconds, ...) -> trace in MuJoCo C, stepped on all cores; it compiles once for each shape.
 
     The control law is the controller's own functions mapped over the robots; `policy.Controller` runs the same lines.
+    Arguments of the function:
 
-    Args:
-      controls: robot, control law and network.
-      batch: the plans, with numpy or jax arrays.
-      sizes: of the plans' boxes, m.
-      seconds: how long.
-      converged: solve contacts to convergence.
-      model_of: (model, episode) -> the model of that episode, for changed masses, friction or motors.
-      before_step: (tick, datas, joint targets (e, 12)) -> joint targets, for pushes and delays.
-      observed: (tick, qpos, qvel) -> what the controller is told of them, for noise.
+    - batch: plans with leading axis e, numpy or jax arrays.
+    - sizes: of the plans' boxes, m.
+    - seconds: how long.
+    - converged: solve contacts to convergence.
+    - model_of: (model, episode) -> the model of that episode, for changed masses, friction or motors.
+    - before_step: (tick, datas, joint targets (e, 12)) -> joint targets, for pushes and delays.
+    - observed: (tick, qpos, qvel) -> what the controller is told of them, for noise.
     """
     import mujoco
 
-    the_robot, robots = controls.robot, batch.boxes.shape[0]
-    ticks, hold = round(seconds / the_robot.timestep), max(1, round(controls.policy_period / the_robot.timestep))
-    batch = jax.tree.map(np.asarray, batch)
-    model = robot.build_model(the_robot.name, sizes, converged, touch=True)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    models = [model if model_of is None else model_of(copy.copy(model), i) for i in range(robots)]
-    for changed in models if model_of is not None else []:
-        mujoco.mj_setConst(changed, mujoco.MjData(changed))  # what MuJoCo derives from masses
-    datas = [mujoco.MjData(m) for m in models]
-    numbers = [
-        plans.step_numbers(jax.tree.map(lambda a, i=i: a[i], batch), the_robot.timestep, ticks) for i in range(robots)
-    ]
-    index, within = (np.array(column) for column in zip(*numbers, strict=True))
+    the_robot = controls.robot
+    hold = max(1, round(controls.policy_period / the_robot.timestep))
 
     @jax.jit
     @jax.vmap
@@ -166,44 +146,72 @@ def in_mujoco(
         return targets, _Memory(state, a_fb), command.target, command.timer, stationary(command.rates)
 
     start = jax.jit(jax.vmap(lambda plan: _start(the_robot, controls.settings, plan)))
-    qpos, memory = start(batch)
-    for data, first in zip(datas, np.asarray(qpos, np.float64), strict=True):
-        data.qpos[:] = first
-    alive = np.ones(robots, bool)
-    samples = []
+    measure = _measure(the_robot)
 
-    def simulate(members: range) -> None:
-        for i in members:
-            if alive[i]:
-                mujoco.mj_step(models[i], datas[i])
+    def record(
+        batch: plans.Plan,
+        sizes: Sequence[Sequence[float]],
+        seconds: float,
+        converged: bool = False,
+        model_of: Callable[[Any, int], Any] | None = None,
+        before_step: Callable[[int, Sequence[Any], np.ndarray], np.ndarray] | None = None,
+        observed: Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
+    ) -> Trace:
+        robots, ticks = batch.boxes.shape[0], round(seconds / the_robot.timestep)
+        batch = jax.tree.map(np.asarray, batch)
+        model = robot.build_model(the_robot.name, sizes, converged, touch=True)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        models = [model if model_of is None else model_of(copy.copy(model), i) for i in range(robots)]
+        for changed in models if model_of is not None else []:
+            mujoco.mj_setConst(changed, mujoco.MjData(changed))  # what MuJoCo derives from masses
+        datas = [mujoco.MjData(m) for m in models]
+        numbers = [
+            plans.step_numbers(jax.tree.map(lambda a, i=i: a[i], batch), the_robot.timestep, ticks) for i in range(robots)
+        ]
+        index, within = (np.array(column) for column in zip(*numbers, strict=True))
+        qpos, memory = start(batch)
+        for data, first in zip(datas, np.asarray(qpos, np.float64), strict=True):
+            data.qpos[:] = first
+        alive = np.ones(robots, bool)
+        samples = []
 
-    workers = os.cpu_count() or 1
-    shares = [range(w, robots, workers) for w in range(workers)]
-    with ThreadPoolExecutor(workers) as pool:
-        for tick in range(ticks):
-            for i in np.flatnonzero((index[:, tick] != index[:, tick - 1]) | (tick == 0)):
-                poses = batch.boxes[i, index[i, tick]]
-                datas[i].mocap_pos[:], datas[i].mocap_quat[:] = poses[:, :3], poses[:, 3:]
-            qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
-            alive = alive & np.asarray(_upright(qpos.T, qvel.T))
-            seen = (qpos, qvel) if observed is None else observed(tick, qpos, qvel)
-            told = [np.where(alive[:, None], part, 0.0).astype(np.float32) for part in seen]
-            think = np.full(robots, tick % hold == 0)
-            targets, memory, target, timer, still = answer(batch, index[:, tick], within[:, tick], memory, *told, think)
-            wanted = np.asarray(targets, np.float64)
-            if before_step is not None:
-                wanted = before_step(tick, datas, wanted)
-            for data, ctrl in zip(datas, wanted, strict=True):
-                data.ctrl[:] = ctrl
-            list(pool.map(simulate, shares))
-            forces = np.array([d.sensordata for d in datas])
-            part = (target, timer, still, memory.feedback)
-            target, timer, still, feedback = jax.tree.map(np.asarray, part)
-            samples.append(_Sample(qpos, qvel, target, timer, still, feedback, wanted, forces, alive))
-            if not alive.any():
-                break
-    stacked = jax.tree.map(lambda *parts: _of_length(np.stack(parts, axis=1), ticks), *samples)
-    return _complete(the_robot, stacked)
+        def simulate(members: range) -> None:
+            for i in members:
+                if alive[i]:
+                    mujoco.mj_step(models[i], datas[i])
+
+        workers = os.cpu_count() or 1
+        shares = [range(w, robots, workers) for w in range(workers)]
+        on_device = jax.device_put(batch)
+        with ThreadPoolExecutor(workers) as pool:
+            for tick in range(ticks):
+                for i in np.flatnonzero((index[:, tick] != index[:, tick - 1]) | (tick == 0)):
+                    poses = batch.boxes[i, index[i, tick]]
+                    datas[i].mocap_pos[:], datas[i].mocap_quat[:] = poses[:, :3], poses[:, 3:]
+                qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
+                alive = alive & np.asarray(_upright(qpos.T, qvel.T))
+                seen = (qpos, qvel) if observed is None else observed(tick, qpos, qvel)
+                told = [np.where(alive[:, None], part, 0.0).astype(np.float32) for part in seen]
+                think = np.full(robots, tick % hold == 0)
+                targets, memory, target, timer, still = answer(
+                    on_device, index[:, tick], within[:, tick], memory, *told, think
+                )
+                wanted = np.asarray(targets, np.float64)
+                if before_step is not None:
+                    wanted = before_step(tick, datas, wanted)
+                for data, ctrl in zip(datas, wanted, strict=True):
+                    data.ctrl[:] = ctrl
+                list(pool.map(simulate, shares))
+                forces = np.array([d.sensordata for d in datas])
+                part = (target, timer, still, memory.feedback)
+                target, timer, still, feedback = jax.tree.map(np.asarray, part)
+                samples.append(_Sample(qpos, qvel, target, timer, still, feedback, wanted, forces, alive))
+                if not alive.any():
+                    break
+        stacked = jax.tree.map(lambda *parts: _of_length(np.stack(parts, axis=1), ticks), *samples)
+        return _complete(the_robot, stacked, measure)
+
+    return record
 
 
 def _start(the_robot: robot.Robot, settings: control.ControlConfig, plan: plans.Plan) -> tuple[Array, _Memory]:
@@ -224,9 +232,14 @@ def _of_length(entries: np.ndarray, ticks: int) -> np.ndarray:
     return entries[:, :ticks] if missing <= 0 else np.concatenate([entries, entries[:, -1:].repeat(missing, axis=1)], axis=1)
 
 
-def _complete(the_robot: robot.Robot, samples: _Sample) -> Trace:
+def _measure(the_robot: robot.Robot) -> Callable[[Array], Nodes]:
+    """The nodes of a robot at qpos (e, n, 19), compiled."""
+    return jax.jit(jax.vmap(jax.vmap(lambda qpos: kinematics.measure(the_robot, qpos))))
+
+
+def _complete(the_robot: robot.Robot, samples: _Sample, measure: Callable[[Array], Nodes]) -> Trace:
     """The trace of samples (e, n, ...): with measured nodes, torques and time."""
-    measured = jax.jit(jax.vmap(jax.vmap(lambda qpos: kinematics.measure(the_robot, qpos))))(samples.qpos)
+    measured = measure(samples.qpos)
     wanted = the_robot.kp * (samples.joint_targets - samples.qpos[..., 7:]) - the_robot.kd * samples.qvel[..., 6:]
     return Trace(
         time=np.arange(samples.qpos.shape[1]) * the_robot.timestep,

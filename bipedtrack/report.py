@@ -1,7 +1,7 @@
 """What an evaluation found as one HTML file: style and figures within, no script, nothing from any other address.
 
-`page` is the table of contents. It takes what `evaluate.run` returns, or metrics.json holds; whatever is missing there is
-left out, or said to be missing.
+`page` is the table of contents. It takes what `evaluate.run` returns; whatever is missing there is left out, or said to be
+missing.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import zlib
 from typing import NamedTuple
 
 import jax
@@ -80,8 +81,8 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
     if name in SCRIPTS:
         return script_batch(footsteps.load(script_path(name), the_robot), episodes)
     hold, what = name.startswith("hold-"), _what(name)
-    steps = int(np.ceil(seconds / ranges.period[0])) + 1
-    key = jax.random.fold_in(jax.random.PRNGKey(seed), TASKS.index(name))
+    steps = int(np.ceil(seconds / min(ranges.period[0], ranges.squat_period[0]))) + 1
+    key = jax.random.fold_in(jax.random.PRNGKey(seed), zlib.crc32(name.encode()))
     given = [_distribution(ranges, what, hold, i) for i in range(episodes)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
     lay_out = jax.jit(jax.vmap(lambda key, one: plans.random_plan(key, one, the_robot, steps)))
