@@ -7,8 +7,10 @@ risers and treads; scripts are the footstep files in `curricula/footsteps/`.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 import zlib
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -85,14 +87,20 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
     key = jax.random.fold_in(jax.random.PRNGKey(seed), zlib.crc32(name.encode()))
     given = [_distribution(ranges, what, hold, i) for i in range(episodes)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
-    lay_out = jax.jit(jax.vmap(lambda key, one: plans.random_plan(key, one, the_robot, steps)))
-    plan = jax.tree.map(np.asarray, lay_out(jax.random.split(key, episodes), stacked))
+    plan = jax.tree.map(np.asarray, _lay_out(the_robot.name, steps)(jax.random.split(key, episodes), stacked))
     narrowed = ", ".join(f"{k} {list(v)}" for k, v in what.narrowed.items()) or "full ranges"
     if what.kind == "stairs":
         narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
     levels = _grid(episodes) if what.kind == "stairs" else _thirds(what.kind, plan)
     return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words, levels)
+
+
+@functools.cache
+def _lay_out(name: str, steps: int) -> Callable[..., plans.Plan]:
+    """Plans of so many task steps for the robot of that name, compiled once for all tasks of one length."""
+    the_robot = robot.load(name)
+    return jax.jit(jax.vmap(lambda key, given: plans.random_plan(key, given, the_robot, steps)))
 
 
 def duration(name: str, ranges: tasks.Ranges, seconds: float) -> float:

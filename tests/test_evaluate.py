@@ -1,0 +1,464 @@
+"""The command line end to end: what it prints and writes against the traces it leaves, ablations, and every refusal."""
+
+import dataclasses
+import json
+import math
+import os
+import pathlib
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import tyro
+
+import bipedtrack
+from bipedtrack import evaluate, footsteps, kinematics, metrics, policy, suite, trace
+from bipedtrack import robot as robots
+from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
+
+ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
+FIRST = ROOT / "models" / "policies" / "first.npz"
+WALK = ROOT / "curricula" / "footsteps" / "walk.csv"
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": str(ROOT),
+    "XLA_FLAGS": "--xla_backend_optimization_level=0",
+    "JAX_PLATFORMS": "cpu",
+}
+PATIENCE = 900  # s that anything may take on a busy machine
+ENGINES = ("mjx", "mujoco", "converged")
+SECONDS, TICKS = 0.65, 130  # no whole number of policy periods
+SHORT = "\n".join([",".join(footsteps.COLUMNS), "left,0.1,,,0.1,0.3", "both,,,,,0.1"])  # 0.4 s
+
+
+class Run(NamedTuple):
+    """A finished evaluation."""
+
+    status: int
+    printed: list[str]
+    errors: str
+    out: pathlib.Path
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """metrics.json, which may hold no number that JSON does not have."""
+        return json.loads((self.out / "metrics.json").read_text(), parse_constant=pytest.fail)
+
+    def summary(self, task: str, name: str, engine: str) -> dict[str, Any]:
+        return self.record["tasks"][task]["policies"][name][engine]["summary"]
+
+    @property
+    def traces(self) -> dict[str, dict[str, np.ndarray]]:
+        return {path.stem: dict(np.load(path)) for path in sorted((self.out / "traces").iterdir())}
+
+
+class Runs(NamedTuple):
+    first: Run  # two episodes of walk-forward with the policy that ships, in all engines
+    zero: Run  # the same without anything that acts
+    script: Run  # two policies of the same file name on a footstep script, in C
+
+
+RANDOM = ("--tasks", "walk-forward", "--episodes", "2", "--seconds", str(SECONDS))
+COMMANDS = Runs(
+    (str(FIRST), *RANDOM), ("zero", *RANDOM), (str(FIRST), "silent/first.npz", "--script", str(WALK), "--engine", "mujoco")
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[pathlib.Path, subprocess.Popen[str]]]:
+    """The evaluations that `runs` waits for, by where they write; meanwhile the tests that need none of them run."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    shipped = policy.load(FIRST)
+    network = shipped.network._replace(weights=tuple(0 * w for w in shipped.network.weights))
+    silent = dataclasses.replace(shipped, network=network._replace(biases=tuple(0 * b for b in network.biases)))
+    (folder / "silent").mkdir()
+    policy.save(dataclasses.replace(silent, provenance={"curriculum": "none"}), folder / "silent" / "first.npz")
+    options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+    processes = {}
+    for out, arguments in COMMANDS._asdict().items():
+        command = [sys.executable, "-m", "bipedtrack.evaluate", *arguments, "--out", out]
+        processes[folder / out] = subprocess.Popen(command, cwd=folder, **options)
+    yield processes
+    for process in processes.values():
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def runs(started: dict[pathlib.Path, subprocess.Popen[str]]) -> Runs:
+    finished = []
+    for out, process in started.items():
+        said, errors = process.communicate(timeout=PATIENCE)
+        finished.append(Run(process.returncode, said.splitlines(), errors, out))
+    return Runs(*finished)
+
+
+def nodes(arrays: dict[str, np.ndarray], side: str) -> Nodes:
+    return Nodes(*(arrays[f"{side}_{field}"].astype(float) for field in Nodes._fields))
+
+
+def by_mujoco(model: mujoco.MjModel, states: np.ndarray) -> Nodes:
+    """The nodes at qpos (n, 19) by MuJoCo's own kinematics."""
+    data, found = mujoco.MjData(model), []
+    feet = [data.body(name) for name in ("left_foot", "right_foot")]
+    for qpos in states:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        yaws = [math.atan2(foot.xmat[3], foot.xmat[0]) for foot in feet]
+        trunk = data.body("trunk")
+        found.append((trunk.xpos.copy(), trunk.xquat.copy(), [foot.xpos.copy() for foot in feet], yaws))
+    return Nodes(*map(np.array, zip(*found, strict=True)))
+
+
+def errors(target: Nodes, real: Nodes) -> dict[str, np.ndarray]:
+    """By the names of the summary: (n,) each."""
+    turns = []
+    for a, b in zip(target.trunk_orientation, real.trunk_orientation, strict=True):
+        turn = np.zeros(3)
+        mujoco.mju_subQuat(turn, a / np.linalg.norm(a), b / np.linalg.norm(b))
+        turns.append(math.degrees(np.linalg.norm(turn)))
+    found = {"trunk_orientation_deg": np.array(turns)}
+    found["trunk_position_cm"] = 100 * np.linalg.norm(target.trunk_position - real.trunk_position, axis=-1)
+    for i, leg in enumerate(("left", "right")):
+        gap = target.ankle_positions[:, i] - real.ankle_positions[:, i]
+        found[f"{leg}_ankle_position_cm"] = 100 * np.sqrt((gap**2).sum(axis=-1))
+        yaws = target.ankle_yaws[:, i] - real.ankle_yaws[:, i]
+        found[f"{leg}_ankle_yaw_deg"] = np.degrees(np.abs(np.angle(np.exp(1j * yaws))))
+    return found
+
+
+# Refusals
+
+
+REFUSALS = {  # the arguments and a part of the line
+    "ik --tasks fly": "--tasks fly: no such task; there are: stand, squat",
+    "nobody.npz": "nobody.npz: cannot be read (No such file or directory)",
+    "cut.npz": "cut.npz: ",
+    "ik cut.npz": "cut.npz: ",
+    "empty": "policy.npz: cannot be read",
+    "ik --script nowhere.csv": "nowhere.csv: cannot be read (No such file or directory)",
+    "ik --script bad.csv": "bad.csv:3: foot is 'middle'; wanted left, right or both",
+    "ik --episodes 0": "--episodes 0: must be at least 1",
+    "ik --seconds 0": "--seconds 0.0: must lie in [0.1, 600]",
+    "ik --seconds nan": "--seconds nan: must lie in [0.1, 600]",
+    "ik --feedback-ratio 3": "--feedback-ratio 3.0: must lie in [0, 2]",
+    "ik --filter 0": "filter must lie in (0, 1], not 0.0",
+    "ik --tasks stand --out cut.npz": "cut.npz",
+    "ik --tasks stand --out cut.npz/inside": "cut.npz/inside",
+    "": "name at least one policy",
+}
+
+
+@pytest.mark.parametrize(("arguments", "wanted"), REFUSALS.items())
+def test_what_cannot_be_evaluated_is_refused_in_one_line(
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    wanted: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    content = FIRST.read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
+    (tmp_path / "bad.csv").write_text("\n".join([*SHORT.splitlines()[:2], "middle,0.1"]))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.setattr(sys, "argv", ["bipedtrack.evaluate", *arguments.split()])
+    with pytest.raises(SystemExit) as refusal:
+        evaluate.main()
+    said = capsys.readouterr()
+    assert (refusal.value.code, said.out, said.err.count("\n")) == (2, "", 1), said
+    assert said.err.startswith("bipedtrack: ") and wanted in said.err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "cut.npz", "empty"]
+
+
+# Ablations
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compile() -> Iterator[None]:
+    """The programs of this process run once."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    path = tmp_path_factory.mktemp("script") / "short.csv"
+    path.write_text(SHORT)
+    return path
+
+
+def test_feedback_ratio_0_is_ik(short: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    arguments = ["ik", str(FIRST), "--feedback-ratio", "0", "--script", str(short), "--engine", "mujoco"]
+    found = evaluate.run(tyro.cli(evaluate.Evaluate, args=[*arguments, "--out", str(tmp_path)]))
+    ik, ablated = found["tasks"]["short"]["policies"].values()
+    for engine in ENGINES[1:]:
+        # the network says something, but nobody listens
+        effort = [one[engine]["summary"]["effort"] for one in (ik, ablated)]
+        assert effort[1]["feedback_mean"] > 0.01 > effort[0]["feedback_max"] == 0
+        for figures in effort:
+            del figures["feedback_mean"], figures["feedback_max"]
+        assert ablated[engine] == ik[engine]
+    # curves and paths, which the report draws, are every tenth entry of what was recorded
+    arrays = dict(np.load(tmp_path / "traces" / "1-first-mujoco-short-0.npz"))
+    assert arrays["alive"].all() and len(arrays["time"]) == 80
+    course, path = (ablated["mujoco"][name] for name in ("course", "path"))
+    said = errors(nodes(arrays, "target"), nodes(arrays, "measured"))
+    assert set(course) == {"time_s", "alive_share", *said} and course["alive_share"] == [1] * 8
+    for name, values in {"time_s": arrays["time"], **said}.items():
+        np.testing.assert_allclose(course[name], values[::10], atol=2e-3)
+    for side in ("target", "measured"):
+        at = nodes(arrays, side)
+        points = {"trunk": at.trunk_position, "left": at.ankle_positions[:, 0], "right": at.ankle_positions[:, 1]}
+        for name, values in points.items():
+            np.testing.assert_allclose(path[side][name], values[::10], atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def record(short: pathlib.Path) -> Callable[..., trace.Trace]:
+    """The trace of the short script in C for the arguments of a command line."""
+
+    def recorded(*arguments: object) -> trace.Trace:
+        options = tyro.cli(evaluate.Evaluate, args=[*map(str, arguments), "--engine", "mujoco"])
+        who = evaluate.subject(options.policies[0], options)
+        batch = suite.script_batch(footsteps.load(short, who.robot))
+        return evaluate.Engines(who, options.engine).record("mujoco", batch, 0.4)
+
+    return recorded
+
+
+def follow(robot: robots.Robot, found: trace.Trace) -> np.ndarray:
+    """The joint angles (n, 12) of the targets by inverse kinematics; the trunk is level here."""
+    targets = [Nodes(*(part[0, t].astype(float) for part in found.target)) for t in range(len(found.time))]
+    return np.array([kinematics.inverse(robot, *ankles_in_trunk_frame(one)) for one in targets])
+
+
+def test_filter_feedback_ratio_and_feedforward_are_those_asked_for(
+    record: Callable[..., trace.Trace], robot: robots.Robot
+) -> None:
+    found = record(FIRST, "--filter", 1, "--feedback-ratio", 0.1)
+    wanted = follow(robot, found) + 0.1 * robot.joint_half_range * found.feedback[0]
+    np.testing.assert_allclose(found.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-5)
+    assert np.abs(found.feedback).max() > 0.01
+
+    stays = record(FIRST, "--filter", 1, "--no-feedforward")
+    wanted = follow(robot, stays)[:1] + 0.3 * robot.joint_half_range * stays.feedback[0]
+    np.testing.assert_allclose(stays.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-5)
+    assert np.ptp(follow(robot, stays), axis=0).max() > 0.1
+
+
+def test_velocity_feedforward_is_switched_on(record: Callable[..., trace.Trace], robot: robots.Robot) -> None:
+    found = record("ik", "--filter", 1, "--velocity-feedforward", True)
+    joints = follow(robot, found)
+    speeds = np.diff(joints, axis=0, prepend=joints[:1]) / 0.005
+    wanted = joints + robot.kd / robot.kp * speeds
+    np.testing.assert_allclose(found.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-4)
+    assert np.abs(wanted - joints).max() > 0.02
+
+
+def test_a_run_directory_stands_for_its_policy(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "policy.npz").write_bytes(FIRST.read_bytes())
+    options = evaluate.Evaluate((str(tmp_path),))
+    found, wanted = (evaluate.subject(name, options) for name in (str(tmp_path), str(FIRST)))
+    assert found.name == str(tmp_path) and found.provenance == wanted.provenance
+    seen = np.linspace(-1, 1, 101, dtype=np.float32)
+    np.testing.assert_array_equal(found.act(seen), wanted.act(seen))
+
+
+# What is printed and written
+
+
+def test_it_ends_with_the_page_and_says_nothing_else(runs: Runs) -> None:
+    for run in runs:
+        assert (run.status, run.errors) == (0, "")
+        assert run.printed[-1] == f"{run.out.name}/report.html"
+        names = sorted(path.name for path in run.out.iterdir())
+        assert names == ["metrics.json", "report.html", "traces"]
+
+
+LINE = re.compile(
+    r"(\S+) +(\S+) +(\S+) +([\d.]+) % up +ankles +([\d.]+) cm \(95 %: +([\d.]+)\) +([\d.]+) deg"
+    r" +trunk +([\d.]+) cm +([\d.]+) deg(?: +foothold +([\d.]+) cm)? +\(\d+ s\)"
+)
+
+
+def test_the_table_has_a_line_for_each_policy_and_engine(runs: Runs) -> None:
+    expected = [
+        (runs.first, [(str(FIRST), "first", engine) for engine in ENGINES], "walk-forward"),
+        (runs.zero, [("zero", "zero", engine) for engine in ENGINES], "walk-forward"),
+        (
+            runs.script,
+            [(name, pathlib.Path(name).stem, engine) for name in (str(FIRST), "silent/first.npz") for engine in ENGINES[1:]],
+            "walk",
+        ),
+    ]
+    for run, rows, task in expected:
+        assert len(run.printed) == len(rows) + 1
+        for line, (name, stem, engine) in zip(run.printed, rows, strict=False):
+            found = LINE.fullmatch(line)
+            assert found, line
+            assert found.groups()[:3] == (stem, task, engine)
+            summary = run.summary(task, name, engine)
+            of = summary["errors"]
+            ankles, yaws = ([of[f"{leg}_ankle_{what}"] for leg in ("left", "right")] for what in ("position_cm", "yaw_deg"))
+            wanted = [
+                100 * summary["survival"]["share"],
+                sum(one["mean"] for one in ankles) / 2,
+                max(one["p95"] for one in ankles),
+                sum(one["mean"] for one in yaws) / 2,
+                of["trunk_position_cm"]["mean"],
+                of["trunk_orientation_deg"]["mean"],
+            ]
+            assert [float(number) for number in found.groups()[3:9]] == pytest.approx(wanted, abs=0.051)
+            foothold = summary["touchdown"]["foothold_cm"]["mean"]
+            assert (found[10] is None) == (foothold is None)
+            assert foothold is None or float(found[10]) == pytest.approx(foothold, abs=0.051)
+
+
+def test_metrics_say_what_was_asked_of_whom_and_with_what(runs: Runs) -> None:
+    record = runs.first.record
+    assert {"options", "versions", "policies", "tasks", "verdicts"} <= set(record)
+    options = record["options"]
+    wanted = {"policies": [str(FIRST)], "tasks": ["walk-forward"], "episodes": 2, "seconds": SECONDS, "engine": "both"}
+    wanted |= {
+        "seed": 2024,
+        "out": "first",
+        "script": None,
+        "robustness": False,
+        "feedback_ratio": None,
+        "feedforward": True,
+    }
+    assert wanted.items() <= options.items()
+    assert set(options) == {field.name for field in dataclasses.fields(evaluate.Evaluate)}
+    for package in ("jax", "mujoco", "mujoco-mjx", "numpy"):
+        assert record["versions"][package] == metadata.version(package)
+    assert record["policies"] == {str(FIRST): policy.load(FIRST).provenance}
+    assert runs.script.record["policies"]["silent/first.npz"] == {"curriculum": "none"}
+    assert runs.zero.record["policies"] == {"zero": {}}
+    assert runs.script.record["options"]["script"] == str(WALK)
+
+
+def test_metrics_hold_tasks_policies_and_engines(runs: Runs) -> None:
+    (task,) = runs.first.record["tasks"].values()
+    assert task["seconds"] == SECONDS and "walk_step [0.03, 0.03, 0.25]" in task["ranges"]
+    assert set(task["policies"]) == {str(FIRST)} and tuple(task["policies"][str(FIRST)]) == ENGINES
+    for run in (runs.first, runs.zero):
+        for found in next(iter(run.record["tasks"]["walk-forward"]["policies"].values())).values():
+            assert set(found) == {"summary", "levels"}
+            assert found["summary"]["episodes"] == 2 and found["summary"]["seconds"] == pytest.approx(SECONDS)
+            # two levels of one episode each; their means are those of all
+            shares = [level["survival"]["share"] for level in found["levels"]]
+            assert len(shares) == 2 and np.mean(shares) == found["summary"]["survival"]["share"]
+            for name in metrics.ERRORS:
+                means = [level["errors"][name]["mean"] for level in found["levels"]]
+                assert np.mean(means) == pytest.approx(found["summary"]["errors"][name]["episode_mean"], rel=1e-4)
+    (script,) = runs.script.record["tasks"].values()
+    assert script["seconds"] == pytest.approx(6 * 0.55 + 2.0) and "walk.csv" in script["ranges"]
+    for engines in script["policies"].values():
+        assert tuple(engines) == ENGINES[1:]
+        for found in engines.values():
+            assert found["levels"] == [] and found["summary"]["episodes"] == 1
+            assert found["summary"]["touchdown"]["planned"] >= 5 or found["summary"]["survival"]["falls"] == 1
+
+
+def test_verdicts_are_about_what_was_evaluated(runs: Runs) -> None:
+    found = runs.first.record["verdicts"]
+    assert {line["about"] for line in found} >= {"figure 6", "two simulators"}
+    for line in found:
+        assert {"about", "task", "policy", "engine", "claim", "figure", "bound", "met"} <= set(line)
+        assert line["policy"] == str(FIRST)
+    up = [
+        line
+        for line in found
+        if line["about"] == "figure 6" and line["engine"] == "mjx" and "without a fall" in line["claim"]
+    ]
+    assert [line["value"] for line in up] == [
+        100 * runs.first.summary("walk-forward", str(FIRST), "mjx")["survival"]["share"]
+    ]
+
+
+def test_the_page_needs_no_other_address(runs: Runs) -> None:
+    for run in runs:
+        page = (run.out / "report.html").read_text()
+        assert page.startswith("<!DOCTYPE html>") and page.rstrip().endswith("</html>")
+        links = re.findall(r"""(?:href|src|srcset|action)\s*=\s*["']?([^"'\s>]*)""", page)
+        assert links and all(link.startswith(("#", "data:")) for link in links)
+        assert not re.search(r"<script|@import|url\(\s*['\"]?(?!#|data:)", page)
+        for task in run.record["tasks"]:
+            assert task in page
+
+
+# Traces
+
+
+def test_errors_of_the_traces_are_those_of_the_summary(runs: Runs, mj_model: mujoco.MjModel) -> None:
+    # the summary is over all episodes, and all have their traces here
+    groups = [(runs.first, str(FIRST), "walk-forward", "0-first", engine, (0, 1)) for engine in ENGINES[:2]]
+    groups += [(runs.zero, "zero", "walk-forward", "0-zero", engine, (0, 1)) for engine in ENGINES[:2]]
+    named = ((str(FIRST), "0-first"), ("silent/first.npz", "1-first"))
+    groups += [(runs.script, name, "walk", stem, "mujoco", (0,)) for name, stem in named]
+    left = {run.out.name: set(run.traces) for run in runs}
+    for run, name, task, stem, engine, episodes in groups:
+        pooled = []
+        for episode in episodes:
+            arrays = run.traces[f"{stem}-{engine}-{task}-{episode}"]
+            left[run.out.name].remove(f"{stem}-{engine}-{task}-{episode}")
+            alive = arrays["alive"]
+            assert len(arrays["time"]) == (TICKS if task == "walk-forward" else 1060)
+            np.testing.assert_allclose(arrays["time"], np.arange(len(alive)) * 0.005, atol=1e-9)
+            target = Nodes(*(part[alive] for part in nodes(arrays, "target")))
+            said = errors(target, Nodes(*(part[alive] for part in nodes(arrays, "measured"))))
+            pooled.append(errors(target, by_mujoco(mj_model, arrays["qpos"][alive])))
+            for error, values in pooled[-1].items():
+                np.testing.assert_allclose(said[error], values, atol=2e-3)
+        for error in metrics.ERRORS:
+            values = np.concatenate([found[error] for found in pooled])
+            wanted = {"mean": values.mean(), "rms": np.sqrt((values**2).mean()), "max": values.max()}
+            wanted |= {"p95": np.percentile(values, 95)}
+            found = run.summary(task, name, engine)["errors"][error]
+            assert {key: found[key] for key in wanted} == pytest.approx(wanted, abs=2e-3, rel=1e-4)
+    assert left == {run.out.name: set() for run in runs}
+
+
+def test_engines_agree_and_every_policy_has_the_same_episodes(runs: Runs) -> None:
+    first = [runs.first.summary("walk-forward", str(FIRST), engine) for engine in ENGINES[:2]]
+    for name in metrics.ERRORS:
+        a, b = (summary["errors"][name]["mean"] for summary in first)
+        assert abs(a - b) < 0.5  # cm or deg
+    for episode in (0, 1):
+        targets = [
+            nodes(run.traces[f"0-{stem}-{engine}-walk-forward-{episode}"], "target")
+            for run, stem in ((runs.first, "first"), (runs.zero, "zero"))
+            for engine in ENGINES[:2]
+        ]
+        for other in targets[1:]:
+            for a, b in zip(targets[0], other, strict=True):
+                np.testing.assert_allclose(a[:40], b[:40], atol=2e-6)
+
+
+def test_zero_keeps_its_joint_targets_in_both_engines(runs: Runs) -> None:
+    for engine in ENGINES[:2]:
+        for episode in (0, 1):
+            arrays, acting = (
+                run.traces[f"0-{stem}-{engine}-walk-forward-{episode}"]
+                for run, stem in ((runs.zero, "zero"), (runs.first, "first"))
+            )
+            first = arrays["qpos"][0, 7:]
+            np.testing.assert_allclose(arrays["joint_targets"], np.tile(first, (TICKS, 1)), atol=1e-5)
+            assert (arrays["feedback"] == 0).all()
+            assert np.ptp(acting["joint_targets"], axis=0).max() > 0.1 and np.abs(acting["feedback"]).max() > 0.01
+
+
+def test_policies_of_the_same_file_name_keep_their_own_traces(runs: Runs) -> None:
+    one, other = (runs.script.traces[f"{stem}-mujoco-walk-0"] for stem in ("0-first", "1-first"))
+    assert np.abs(one["feedback"]).max() > 0.05 and (other["feedback"] == 0).all()
+    assert np.abs(one["qpos"] - other["qpos"])[:100].max() > 1e-3
