@@ -79,7 +79,7 @@ class Progress:
 
     def _show(self, call: Call, steps: int, figures: dict[str, float], doing: str) -> None:
         step = self._done + steps
-        left = f"{(self._total - step) / self._rate / 60:.0f} min left" if self._rate else ""
+        left = f"{max(self._total - step, 0) / self._rate / 60:.0f} min left" if self._rate else ""
         shown = {
             "stage": f"{call.stage.name}, {call.lesson.name} (call {call.index + 1} of {len(self._calls)})",
             "doing": doing,

@@ -344,14 +344,20 @@ def test_a_policy_file_with_one_bit_flipped_is_refused(content, scratch, data):
 def test_what_is_no_policy_file_is_refused(tmp_path, content):
     path = tmp_path / "policy.npz"
     assert "No such file" in refused(path)
-    path.mkdir()
-    refused(path)
     other = tmp_path / "other.npz"
     np.savez(other, weight=np.ones(3))
     refused(other)
     arrays, meta = saved(content, other)
     checkpoint.save_arrays(other, arrays, {"index": 3, "meta": meta}, "checkpoint")
     assert "is a checkpoint file; wanted a policy file" in refused(other)
+
+
+def test_a_run_directory_stands_for_its_policy(tmp_path, content):
+    with pytest.raises(checkpoint.CheckpointError, match=rf"^{tmp_path}/policy.npz: No such file"):
+        policy.load(tmp_path)
+    (tmp_path / "policy.npz").write_bytes(content)
+    by_folder, by_file = policy.load(tmp_path), policy.load(tmp_path / "policy.npz")
+    assert by_folder.network.weights[0].tobytes() == by_file.network.weights[0].tobytes()
 
 
 def saved(content, path):

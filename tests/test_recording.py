@@ -308,11 +308,18 @@ def test_when_all_have_fallen_the_trace_keeps_its_length(
     rolled = jax.tree.map(np.copy, plan)
     for nodes in (rolled.steps.start, rolled.steps.end):
         nodes.trunk_orientation[:] = [math.cos(ROLL / 2), math.sin(ROLL / 2), 0, 0]
-    compiled = len(recorders.compiled)
-    fallen = recorders.mjx(rolled, SECONDS) if engine == "mjx" else recorders.mujoco(rolled, SIZES, SECONDS)
+    compiled, ticks = len(recorders.compiled), []
+
+    def count(tick: int, datas: Any, targets: np.ndarray) -> np.ndarray:
+        ticks.append(tick)
+        return targets
+
+    mjx = engine == "mjx"
+    fallen = recorders.mjx(rolled, SECONDS) if mjx else recorders.mujoco(rolled, SIZES, SECONDS, before_step=count)
     assert len(recorders.compiled) == compiled  # for the first plan, but not anew
     # MJX looks every second, C at every step
-    stopped = 200 if engine == "mjx" else int(fallen.alive.sum(axis=1).max()) + 1
+    stopped = 200 if mjx else len(ticks)
+    assert mjx or stopped == fallen.alive.sum(axis=1).max() + 1
     assert fallen.time.shape == (TICKS,)
     assert all(leaf.shape[:2] == (len(KINDS), TICKS) for leaf in jax.tree.leaves(tuple(fallen[1:])))
     assert fallen.alive[:, 0].all() and not fallen.alive[:, stopped:].any() and 2 < stopped <= 200
