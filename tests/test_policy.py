@@ -353,7 +353,7 @@ def test_what_is_no_policy_file_is_refused(tmp_path, content):
 
 
 def test_a_run_directory_stands_for_its_policy(tmp_path, content):
-    with pytest.raises(checkpoint.CheckpointError, match=rf"^{tmp_path}/policy.npz: No such file"):
+    with pytest.raises(checkpoint.CheckpointError, match=rf"^{tmp_path}/policy.npz: cannot be read"):
         policy.load(tmp_path)
     (tmp_path / "policy.npz").write_bytes(content)
     by_folder, by_file = policy.load(tmp_path), policy.load(tmp_path / "policy.npz")
