@@ -65,6 +65,10 @@ class PpoConfig:
         """Policy steps that one update of the network learns from."""
         return self.num_envs * self.unroll_length
 
+    def shares_out(self, devices: int) -> bool:
+        """Whether every device gets as many robots as any other, and whole unrolls in each of its minibatches."""
+        return self.num_envs % (devices * self.num_minibatches) == 0
+
 
 @dataclasses.dataclass(frozen=True)
 class Lesson:
@@ -94,14 +98,17 @@ class Stage:
     lessons: tuple[Lesson, ...]
     hold_share: float = 0.0  # share of the episodes that stop after some task steps and hold
     hold_after: tuple[int, int] = (1, 8)  # least and greatest number of task steps before a hold
+    mix_share: float = 0.0  # share of the episodes on level ground that change their kind every few task steps
+    push_share: float = 0.0  # share of the episodes with pushes
 
     def __post_init__(self) -> None:
         if not self.lessons:
             raise ValueError(f"stage {self.name!r} has no lessons")
         if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon) < 0:
             raise ValueError("learning_rate, entropy_cost and clipping_epsilon must not be negative")
-        if not 0 <= self.hold_share <= 1:
-            raise ValueError(f"hold_share must lie in [0, 1], not {self.hold_share}")
+        for name in ("hold_share", "mix_share", "push_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:
             raise ValueError(f"hold_after must be two growing numbers of task steps, not {list(self.hold_after)}")
 
@@ -191,11 +198,16 @@ def load(name_or_path: str) -> Curriculum:
     return config.load(Curriculum, path)
 
 
-def of_run(run: checkpoint.RunDirectory) -> tuple[Curriculum, int]:
-    """The curriculum and the seed that a run was started with. Raises RunError or ConfigError where they are damaged."""
+def of_run(run: checkpoint.RunDirectory) -> tuple[Curriculum, int, int]:
+    """The curriculum, the seed and the number of devices that a run was started with.
+
+    Raises RunError or ConfigError where they are damaged.
+    """
     settings, file = run.settings, run.path / "run.json"
     if not isinstance(settings, dict) or not isinstance(settings.get("curriculum"), dict):
         raise checkpoint.RunError(f"{file}: is damaged: it has no curriculum; start a new run")
-    if not isinstance(settings.get("seed"), int):
-        raise checkpoint.RunError(f"{file}: is damaged: it has no seed; start a new run")
-    return config.from_dict(Curriculum, settings["curriculum"], str(file)), settings["seed"]
+    seed, devices = settings.get("seed"), settings.get("devices", 1)  # before it was written, there was one
+    if not isinstance(seed, int) or not isinstance(devices, int):
+        name = "devices" if isinstance(seed, int) else "seed"
+        raise checkpoint.RunError(f"{file}: is damaged: it has no {name}; start a new run")
+    return config.from_dict(Curriculum, settings["curriculum"], str(file)), seed, devices

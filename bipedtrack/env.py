@@ -29,6 +29,8 @@ from bipedtrack import (
 )
 from bipedtrack.rotations import Array
 
+_PUSH_SECONDS = 0.1  # s that a push lasts
+_PUSH_EVERY = 2.0  # s between the pushes of one episode, on average
 _LARGEST = 1e3  # m, rad, m/s or rad/s: a state beyond has exploded; one such number would spoil the normaliser for all
 
 
@@ -66,6 +68,8 @@ class Episode(NamedTuple):
     tick: Array  # () control steps into it
     control: control.ControlState
     feedback: Array  # (12,) a_fb(t-1)
+    push: Array  # (3,) N, force on the trunk's centre, in the world frame
+    push_left: Array  # () policy steps for which it still lasts
 
 
 class Answer(NamedTuple):
@@ -138,7 +142,7 @@ class TrackingEnv(brax.envs.Env):
     def begin(self, key: Array, given: Any) -> brax.envs.State:
         """A new episode drawn from `given`. No forward dynamics: joint angles come from inverse kinematics."""
         key, key_task, key_step = jax.random.split(key, 3)
-        task, start = self.source.begin(key_task, given, self.robot.ankle_height)
+        task, start = self.source.begin(key_task, given, self.robot)
         index = jnp.int32(0)
         step = self._task_step(key_step, given, task, index, start)
         qpos, memory = standing(self.robot, self.config.control, start)
@@ -158,6 +162,8 @@ class TrackingEnv(brax.envs.Env):
             tick=jnp.int32(0),
             control=memory,
             feedback=jnp.zeros(self.action_size),
+            push=jnp.zeros(3),
+            push_left=jnp.int32(0),
         )
         zero = jnp.float32(0)
         names = [
@@ -180,7 +186,8 @@ class TrackingEnv(brax.envs.Env):
         """One policy step: the feedback is held while planner, feedforward, filter and PD run at 200 Hz."""
         before, episode = state.pipeline_state, state.info["episode"]
         a_fb = jnp.clip(self.config.control.feedback_scale * action, -1.0, 1.0)
-        advance = lambda carry, _: self.control_step(carry[0], carry[1], a_fb)  # noqa: E731
+        episode, following = self.look_ahead(self._pushed(episode))
+        advance = lambda carry, _: self.control_step(carry[0], carry[1], following, a_fb)  # noqa: E731
         (physics, episode), answer = jax.lax.scan(advance, (before, episode), length=self.substeps)
 
         # false for nan, too
@@ -213,43 +220,67 @@ class TrackingEnv(brax.envs.Env):
             info={**state.info, "episode": episode},
         )
 
-    def control_step(self, physics: Physics, episode: Episode, a_fb: Array) -> tuple[tuple[Physics, Episode], Answer]:
+    def look_ahead(self, episode: Episode) -> tuple[Episode, planner.TaskStep]:
+        """The task step after the present one, for all control steps of a policy step, which is far shorter than either."""
+        key, key_step = jax.random.split(episode.key)
+        step = self._task_step(key_step, episode.given, episode.task, episode.index + 1, episode.step.end)
+        return episode._replace(key=key), step
+
+    def _pushed(self, episode: Episode) -> Episode:
+        """The episode with this policy step's force: none, one that goes on, or a new one in any horizontal direction."""
+        key, key_when, key_what = jax.random.split(episode.key, 3)
+        period = self.config.policy_period
+        begins = jax.random.uniform(key_when) < period / _PUSH_EVERY
+        u = jax.random.uniform(key_what, (2,))
+        lasts = max(1, round(_PUSH_SECONDS / period))
+        size = u[0] * self.source.push(episode.given, episode.task) / (lasts * period)
+        force = size * jnp.stack([jnp.cos(2 * jnp.pi * u[1]), jnp.sin(2 * jnp.pi * u[1]), jnp.float32(0)])
+        goes_on = episode.push_left > 0
+        return episode._replace(
+            key=key,
+            push=jnp.where(goes_on, episode.push, jnp.where(begins, force, 0.0)),
+            push_left=jnp.where(goes_on, episode.push_left - 1, jnp.where(begins, lasts - 1, 0)),
+        )
+
+    def control_step(
+        self, physics: Physics, episode: Episode, following: planner.TaskStep, a_fb: Array
+    ) -> tuple[tuple[Physics, Episode], Answer]:
         """One control step of 0.005 s with a feedback (12,): eqs (4)-(7), physics, clock."""
         wanted = self.feedforward_nodes(episode, self.command(episode))
         a_ff = control.feedforward(self.robot, self.config.control, wanted)
         targets, memory = control.joint_targets(self.robot, self.config.control, episode.control, a_ff, a_fb)
-        physics = self._simulate(physics, targets)
-        episode = self._tick(episode._replace(control=memory))
+        physics = self.simulate(physics, targets, episode.push)
+        episode = self._tick(episode._replace(control=memory), following)
         boxes = self._boxes(episode.given, episode.task, episode.index)
         return (physics._replace(boxes=boxes), episode), Answer(targets, physics.warmstart)
 
-    def _simulate(self, physics: Physics, joint_targets: Array) -> Physics:
-        """MJX from t to t + 0.005 s with the PD controllers at the given joint targets, (12,) rad."""
+    def simulate(self, physics: Physics, joint_targets: Array, push: Array) -> Physics:
+        """MJX from t to t + 0.005 s with PD controllers at joint targets, (12,) rad, and a force on the trunk, (3,) N."""
         data = self._blank.replace(
-            qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart, ctrl=joint_targets
+            qpos=physics.qpos,
+            qvel=physics.qvel,
+            qacc_warmstart=physics.warmstart,
+            ctrl=joint_targets,
+            qfrc_applied=self._blank.qfrc_applied.at[:3].set(push),
         )
         if self.mj_model.nmocap:
             data = data.replace(mocap_pos=physics.boxes[:, :3], mocap_quat=physics.boxes[:, 3:])
         data = mjx.step(self.mjx_model, data)
         return physics._replace(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc, sensors=data.sensordata)
 
-    def _tick(self, episode: Episode) -> Episode:
+    def _tick(self, episode: Episode, following: planner.TaskStep) -> Episode:
         """The clock one control step on, into the next task step where this one is over."""
         tick = episode.tick + 1
         over = tick >= jnp.round(episode.step.period / self.robot.timestep)
-        key, key_step = jax.random.split(episode.key)
-        index = episode.index + 1
-        following = self._task_step(key_step, episode.given, episode.task, index, episode.step.end)
         choose = lambda new, old: jnp.where(over, new, old)  # noqa: E731
         return episode._replace(
-            key=key,
             step=jax.tree.map(choose, following, episode.step),
-            index=choose(index, episode.index),
+            index=choose(episode.index + 1, episode.index),
             tick=choose(jnp.int32(0), tick),
         )
 
     def _task_step(self, key: Array, given: Any, task: Any, index: Array, start: nodes.Nodes) -> planner.TaskStep:
-        return self.source.next_step(key, given, task, index, start, self.robot.ankle_height, self.robot.timestep)
+        return self.source.next_step(key, given, task, index, start, self.robot)
 
     def command(self, episode: Episode) -> planner.Command:
         """The command at this instant."""

@@ -63,7 +63,7 @@ def export(run: pathlib.Path, out: pathlib.Path) -> policy.Policy:
     Raises checkpoint.RunError or checkpoint.CheckpointError where the run or its checkpoint cannot be read.
     """
     directory = checkpoint.RunDirectory(run)
-    plan, seed = curriculum.of_run(directory)
+    plan, seed, _ = curriculum.of_run(directory)
     found = directory.latest()
     for warning in directory.warnings:
         print(f"warning: {warning}", file=sys.stderr)

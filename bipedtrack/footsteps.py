@@ -177,13 +177,14 @@ def parse(text: str, robot: Robot, name: str) -> Script:
 
 
 def initial_nodes(robot: Robot) -> Nodes:
-    """Where every script starts: feet side by side on the ground, facing x, the trunk over them; float64."""
-    return Nodes(
+    """Where every script starts: feet side by side on the ground, facing x, the centre of mass between them; float64."""
+    upright = Nodes(
         trunk_position=np.array([0.0, 0.0, TRUNK_HEIGHT]),
         trunk_orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         ankle_positions=np.array([[0.0, y, robot.ankle_height] for y in FEET_Y]),
         ankle_yaws=np.zeros(2),
     )
+    return _balanced(robot, upright)
 
 
 def initial_qpos(robot: Robot) -> np.ndarray:
@@ -359,16 +360,23 @@ def _task_step(robot: Robot, boxes: Iterable[Box], start: Nodes, row: _Row) -> T
 
 
 def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: dict[str, float]) -> Nodes:
-    """Nodes with the trunk where `values` say, or else over the feet."""
+    """Nodes with the trunk where `values` say, or else with the centre of mass over the feet's middle."""
     given = values.get
     x, y, z = ankles.mean(axis=0)
-    z += TRUNK_HEIGHT - robot.ankle_height
+    z = given("trunk_z", z + TRUNK_HEIGHT - robot.ankle_height)
     angles = given("trunk_roll", 0.0), given("trunk_pitch", 0.0), given("trunk_yaw", yaws.mean())
     orientation = rotations.from_euler(*angles)
     if orientation @ start.trunk_orientation < 0:  # of the two quaternions the one that goes on from the last
         orientation = -orientation
-    position = np.array([given("trunk_x", x), given("trunk_y", y), given("trunk_z", z)])
-    return Nodes(position, orientation, ankles, yaws)
+    x, y = _balanced(robot, Nodes(np.array([x, y, z]), orientation, ankles, yaws)).trunk_position[:2]
+    return Nodes(np.array([given("trunk_x", x), given("trunk_y", y), z]), orientation, ankles, yaws)
+
+
+def _balanced(robot: Robot, nodes: Nodes) -> Nodes:
+    """The nodes with the trunk moved level until the centre of mass stands over the feet's middle."""
+    for _ in range(3):
+        nodes = kinematics.balanced(robot, nodes, nodes.ankle_positions.mean(axis=0)[:2])
+    return nodes
 
 
 def _known(nodes: Nodes) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from bipedtrack import rotations
-from bipedtrack.nodes import Nodes
+from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
@@ -92,6 +92,44 @@ def inverse(robot: Robot, ankles: Array, yaws: Array) -> Array:
     return joints.reshape(12)
 
 
+def centre_of_mass(robot: Robot, joints: Array) -> Array:
+    """The centre of mass of the whole robot, (3,) m in F_B, of joint angles (12,), rad."""
+    xp = namespace(joints)
+    q = joints.reshape(2, 6)
+    shank, foot = q[:, 2] + q[:, 3], q[:, 2] + q[:, 3] + q[:, 4]
+    trunk_mass, *masses = (float(mass) for mass in robot.masses)
+    lengths = robot.thigh, robot.shank, 0.0
+    x, z, at_x, at_z = (xp.zeros_like(shank) for _ in range(4))
+    for pitch, mass, centre, length in zip((q[:, 2], shank, foot), masses, robot.centres, lengths, strict=True):
+        sine, cosine = xp.sin(pitch), xp.cos(pitch)
+        x, z = x + mass * (at_x - float(centre) * sine), z + mass * (at_z - float(centre) * cosine)
+        at_x, at_z = at_x - length * sine, at_z - length * cosine
+    legs = sum(masses) * xp.asarray(robot.hips, dtype=joints.dtype) + _turn_hips(q, x, z)
+    return legs.sum(axis=0) / (trunk_mass + 2 * sum(masses))
+
+
+def balanced(robot: Robot, nodes: Nodes, centre: Array) -> Nodes:
+    """The nodes with the trunk moved level so that the robot's centre of mass stands nearer to `centre`, (2,) m.
+
+    Bent knees carry it up to 8 cm ahead of the trunk. The legs follow the trunk by half, so every application leaves a few
+    percent of the distance.
+    """
+    xp = namespace(centre)
+    joints = inverse(robot, *project(robot, *ankles_in_trunk_frame(nodes)))
+    to_w = rotations.to_matrix(nodes.trunk_orientation).T
+    mass = nodes.trunk_position + centre_of_mass(robot, joints) @ to_w
+    move = xp.concat([1.3 * (centre - mass[:2]), xp.zeros_like(centre[:1])])
+    return nodes._replace(trunk_position=nodes.trunk_position + move)
+
+
+def _turn_hips(q: Array, x: Array, z: Array) -> Array:
+    """Rz(hip yaw) Rx(hip roll) applied to (x, 0, z) of both legs, (2, 3); q (2, 6) rad, x and z (2,)."""
+    xp = namespace(q)
+    s0, c0, s1, c1 = xp.sin(q[:, 0]), xp.cos(q[:, 0]), xp.sin(q[:, 1]), xp.cos(q[:, 1])
+    y = -s1 * z
+    return xp.stack([c0 * x - s0 * y, s0 * x + c0 * y, c1 * z], axis=-1)
+
+
 def forward(robot: Robot, joints: Array) -> tuple[Array, Array]:
     """Ankle positions (2, 3), m, and the feet's x axes (2, 3), in F_B, of joint angles (12,), rad."""
     xp = namespace(joints)
@@ -100,15 +138,8 @@ def forward(robot: Robot, joints: Array) -> tuple[Array, Array]:
     x = -robot.thigh * xp.sin(q[:, 2]) - robot.shank * xp.sin(pitch)
     z = -robot.thigh * xp.cos(q[:, 2]) - robot.shank * xp.cos(pitch)
     pitch = pitch + q[:, 4]
-    heading_x, heading_z = xp.cos(pitch), -xp.sin(pitch)
-    s0, c0, s1, c1 = xp.sin(q[:, 0]), xp.cos(q[:, 0]), xp.sin(q[:, 1]), xp.cos(q[:, 1])
-
-    def turn(x: Array, z: Array) -> Array:
-        """Rz(q0) Rx(q1) applied to (x, 0, z)."""
-        y = -s1 * z
-        return xp.stack([c0 * x - s0 * y, s0 * x + c0 * y, c1 * z], axis=-1)
-
-    return xp.asarray(robot.hips, dtype=joints.dtype) + turn(x, z), turn(heading_x, heading_z)
+    headings = _turn_hips(q, xp.cos(pitch), -xp.sin(pitch))
+    return xp.asarray(robot.hips, dtype=joints.dtype) + _turn_hips(q, x, z), headings
 
 
 def level_feet(robot: Robot, joints: Array, trunk_orientation: Array) -> Array:

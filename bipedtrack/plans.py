@@ -28,11 +28,11 @@ class Plan(NamedTuple):
 def random_plan(key: Array, given: tasks.Distribution, the_robot: robot.Robot, steps: int) -> Plan:
     """An episode of `steps` task steps drawn at random, with the boxes of its stairs; for `jit` and `vmap`."""
     key, key_begin = jax.random.split(key)
-    task, start = tasks.begin(key_begin, given, the_robot.ankle_height)
+    task, start = tasks.begin(key_begin, given, the_robot)
 
     def one(start: Nodes, numbered: tuple[Array, Array]) -> tuple[Nodes, tuple[TaskStep, Array]]:
         index, key = numbered
-        step = tasks.next_step(key, given, task, index, start, the_robot.ankle_height, the_robot.timestep)
+        step = tasks.next_step(key, given, task, index, start, the_robot)
         return step.end, (step, tasks.stair_window(given, task, index))
 
     _, (laid_out, boxes) = jax.lax.scan(one, start, (jnp.arange(steps), jax.random.split(key, steps)))
@@ -53,13 +53,11 @@ def script_plan(script: footsteps.Script) -> Plan:
     return Plan(steps, np.tile(boxes, (len(script.steps) + 1, 1, 1)))
 
 
-def _begin(key: Array, plan: Plan, ankle_height: float) -> tuple[tuple[()], Nodes]:
+def _begin(key: Array, plan: Plan, the_robot: robot.Robot) -> tuple[tuple[()], Nodes]:
     return (), jax.tree.map(lambda leaf: leaf[0], plan.steps.start)
 
 
-def _next_step(
-    key: Array, plan: Plan, task: tuple[()], index: Array, start: Nodes, ankle_height: float, timestep: float
-) -> TaskStep:
+def _next_step(key: Array, plan: Plan, task: tuple[()], index: Array, start: Nodes, the_robot: robot.Robot) -> TaskStep:
     return jax.tree.map(lambda leaf: leaf[_number(plan, index)], plan.steps)
 
 
@@ -71,7 +69,7 @@ def _number(plan: Plan, index: Array) -> Array:
     return jnp.minimum(index, plan.boxes.shape[0] - 1)
 
 
-PLANNED = tasks.Source(_begin, _next_step, _boxes)
+PLANNED = tasks.Source(_begin, _next_step, _boxes, lambda plan, task: jnp.float32(0))
 
 
 def step_numbers(plan: Any, timestep: float, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -141,6 +141,8 @@ ROBOT_SHAPES = {
     "hips": (2, 3),
     "sole": (2,),
     "leg_length": (2,),
+    "masses": (4,),
+    "centres": (3,),
     **dict.fromkeys(("joint_low", "joint_high", "feedback_ratio", "kp", "kd", "torque_limit"), (12,)),
 }
 """The arrays of a Robot and their shapes."""

@@ -54,19 +54,20 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
     def policy_step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], _Sample]:
         state, alive = carry
         a_fb = jnp.clip(scale * act(state.obs), -1.0, 1.0)
+        episode, following = the_env.look_ahead(state.info["episode"])
 
         def control_step(carry: Any, _: None) -> tuple[Any, _Sample]:
             (physics, episode), alive = carry
             command = the_env.command(episode)
             alive = alive & _upright(physics.qpos, physics.qvel)
-            moved, answer = the_env.control_step(physics, episode, a_fb)
+            moved, answer = the_env.control_step(physics, episode, following, a_fb)
             sample = _Sample(
                 physics.qpos, physics.qvel, command.target, command.timer, stationary(command.rates), a_fb,
                 answer.joint_targets, moved[0].sensors, alive,
             )  # fmt: skip
             return (moved, alive), sample
 
-        start = ((state.pipeline_state, state.info["episode"]), alive)
+        start = ((state.pipeline_state, episode), alive)
         ((physics, episode), alive), samples = jax.lax.scan(control_step, start, length=the_env.substeps)
         episode = episode._replace(feedback=a_fb)
         obs = the_env.observe(physics, episode, the_env.command(episode))

@@ -37,6 +37,8 @@ class Robot:
     kp: np.ndarray  # (12,) N m / rad
     kd: np.ndarray  # (12,) N m s / rad
     torque_limit: np.ndarray  # (12,) N m
+    masses: np.ndarray  # (4,) trunk, thigh, shank, foot, kg; both legs weigh the same
+    centres: np.ndarray  # (3,) centres of mass of thigh, shank and foot, m below hip, knee and ankle
     timestep: float  # control period, s
 
     @property
@@ -110,7 +112,11 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         carried = {name: model.body(int(model.joint(f"{leg}_{name}").bodyid[0])) for name in description.joints}
         return carried["hip_yaw"].pos, carried["knee"].pos, carried["ankle_pitch"].pos
 
+    def link(joint: str) -> Any:
+        return model.body(int(model.joint(f"{description.legs[0]}_{joint}").bodyid[0]))
+
     left, right = (chain(leg) for leg in description.legs)
+    links = [link(joint) for joint in ("hip_yaw", "knee", "ankle_pitch")]
     soles = [g for g in map(model.geom, range(model.ngeom)) if g.name.startswith(f"{description.legs[0]}_sole")]
     if not soles:
         raise RobotError(f"{name}: no geom is named {description.legs[0]}_sole_*, which touch the ground")
@@ -130,6 +136,8 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         kp=model.actuator_gainprm[:, 0].copy(),
         kd=-model.actuator_biasprm[:, 2],
         torque_limit=model.actuator_forcerange[:, 1].copy(),
+        masses=np.array([model.body(description.trunk).mass[0], *(link.mass[0] for link in links)]),
+        centres=np.array([-link.ipos[2] for link in links]),
         timestep=float(model.opt.timestep),
     )
 

@@ -6,19 +6,22 @@ Random numbers are jax's; the namespace is jax.numpy.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from bipedtrack import nodes, planner, rotations, terrain
+from bipedtrack import kinematics, nodes, planner, rotations, terrain
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
+from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array
 
 KINDS = ("stand", "squat", "walk", "sidle", "turn", "stairs")
 STAND, SQUAT, WALK, SIDLE, TURN, STAIRS = range(len(KINDS))
+MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
 FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
 
@@ -44,8 +47,12 @@ class Ranges(NamedTuple):
     curve_along: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # shift of the Bezier control points, share of the way
     curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
     trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
-    posture_x: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # m, trunk ahead of the feet's middle (stand, squat)
-    posture_y: tuple[float, float, float] = (-0.04, 0.0, 0.04)  # m
+    posture_x: tuple[float, float, float] = (
+        -0.05,
+        0.0,
+        0.05,
+    )  # m, centre of mass ahead of the feet's middle (stand, squat; else 0)
+    posture_y: tuple[float, float, float] = (-0.04, 0.0, 0.04)  # m, to the left of it
     posture_height: tuple[float, float, float] = (0.60, 0.75, 0.79)  # m
     posture_roll: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
     posture_pitch: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
@@ -54,6 +61,7 @@ class Ranges(NamedTuple):
     foot_distance: tuple[float, float, float] = (0.17, 0.20, 0.30)  # m
     foot_yaw: tuple[float, float, float] = (-0.2, 0.0, 0.2)  # rad
     squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s
+    push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
 
     def validate(self) -> None:
         """Raises ValueError where a range does not grow."""
@@ -87,20 +95,31 @@ class Distribution(NamedTuple):
     hold_share: Array  # () share of the episodes that stop and hold
     hold_after: Array  # (2,) least and greatest number of task steps before the hold
     down_share: Array  # () share of the stairs that go down
+    mix_share: Array  # () share of the episodes on level ground that change their kind every MIX_STEPS task steps
+    push_share: Array  # () share of the episodes with pushes
     ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
+
+
+class Motion(NamedTuple):
+    """What task steps of one kind have in common."""
+
+    kind: Array  # () index in KINDS
+    advance: Array  # (3,) x m, y m, yaw rad by which the place of the feet moves on, per task step
+    first: Array  # () foot that swings at even task steps, 0 left, 1 right
+    period: Array  # () s
+    lift: Array  # () m
+    trunk_height: Array  # () m
 
 
 class Task(NamedTuple):
     """What an episode keeps from its first to its last task step."""
 
-    kind: Array  # () index in KINDS
-    advance: Array  # (3,) x m, y m, yaw rad by which the place of the feet moves on, per task step
-    first: Array  # () foot that swings first, 0 left, 1 right
-    period: Array  # () s
-    lift: Array  # () m
-    trunk_height: Array  # () m
+    motion: Motion
     stairs: terrain.Stairs
     hold_after: Array  # () number of task steps after which every target stays where it is
+    mixes: Array  # () bool: another motion every MIX_STEPS task steps
+    key: Array  # of those motions
+    push: Array  # () N s, the greatest impulse of a push
 
 
 def distribution(
@@ -110,6 +129,8 @@ def distribution(
     hold_share: float,
     hold_after: tuple[int, int],
     down_share: float = 0.5,
+    mix_share: float = 0.0,
+    push_share: float = 0.0,
 ) -> Distribution:
     """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
     total = jnp.array(shares, jnp.float32)
@@ -123,6 +144,8 @@ def distribution(
         hold_share=jnp.float32(hold_share),
         hold_after=jnp.array(hold_after, jnp.float32),
         down_share=jnp.float32(down_share),
+        mix_share=jnp.float32(mix_share),
+        push_share=jnp.float32(push_share),
         ranges=scaled,
     )
 
@@ -138,31 +161,53 @@ def _within(u: Array, bounds: Array) -> Array:
     return bounds[0] + u * (bounds[1] - bounds[0])
 
 
-def _posture(draw: dict[str, Array], ankles: Array, yaws: Array, ankle_height: float) -> tuple[Array, Array]:
-    """A trunk position (3,) and orientation (4,) over ankles (2, 3), m, with yaws (2,)."""
+class _Posture(NamedTuple):
+    """How the trunk is held over the feet."""
+
+    centre: Array  # (2,) m, the centre of mass ahead of and to the left of the feet's middle
+    height: Array  # () m, the trunk above the mean of the soles
+    roll: Array  # () rad
+    pitch: Array  # () rad
+    yaw: Array  # () rad, from the mean of the feet's
+
+
+def _drawn_posture(draw: dict[str, Array]) -> _Posture:
+    centre = jnp.stack([draw["posture_x"], draw["posture_y"]])
+    return _Posture(centre, draw["posture_height"], draw["posture_roll"], draw["posture_pitch"], draw["posture_yaw"])
+
+
+def _upright(height: Array) -> _Posture:
+    zero = jnp.float32(0)
+    return _Posture(jnp.zeros(2), height, zero, zero, zero)
+
+
+def _over_feet(posture: _Posture, ankles: Array, yaws: Array, robot: Robot) -> Nodes:
+    """Nodes with the trunk held so over ankles (2, 3), m, with yaws (2,), that its centre of mass stands where it should."""
     yaw = yaws.mean()
     middle = ankles.mean(axis=0)
     c, s = jnp.cos(yaw), jnp.sin(yaw)
-    x, y = draw["posture_x"], draw["posture_y"]
-    shift = jnp.stack([c * x - s * y, s * x + c * y, draw["posture_height"] - ankle_height])
-    return middle + shift, rotations.from_euler(draw["posture_roll"], draw["posture_pitch"], yaw + draw["posture_yaw"])
+    centre = middle[:2] + jnp.array([[c, -s], [s, c]]) @ posture.centre
+    height = middle[2:] + posture.height - robot.ankle_height
+    orientation = rotations.from_euler(posture.roll, posture.pitch, yaw + posture.yaw)
+    nodes = Nodes(jnp.concatenate([centre, height]), orientation, ankles, yaws)
+    return jax.lax.fori_loop(0, 3, lambda _, nodes: kinematics.balanced(robot, nodes, centre), nodes)
 
 
 _POSTURE = ("posture_x", "posture_y", "posture_height", "posture_roll", "posture_pitch", "posture_yaw")
 
 
-def begin(key: Array, given: Distribution, ankle_height: float) -> tuple[Task, Nodes]:
-    """A new episode's task and the nodes it starts from; ankle_height is the ankle above the sole, m."""
-    key_kind, key_task, key_posture = jax.random.split(key, 3)
-    u: Array = jax.random.uniform(key_kind, (5,))
-    kind = jnp.minimum(jnp.searchsorted(given.shares, u[0], side="right"), len(KINDS) - 1)
+def _motion(key: Array, given: Distribution, level: bool) -> tuple[Motion, dict[str, Array]]:
+    """Task steps of a kind drawn by its share, of those on level ground or of all, and what else was drawn for them."""
+    key_kind, key_motion = jax.random.split(key)
+    u: Array = jax.random.uniform(key_kind, (2,))
+    reach = given.shares[STAIRS - 1] if level else 1.0
+    kind = jnp.minimum(jnp.searchsorted(given.shares, reach * u[0], side="right"), STAIRS - 1 if level else STAIRS)
     draw = _draw(
-        key_task,
+        key_motion,
         ("period", "walk_step", "sidle_step", "turn_yaw", "turn_radius", "stair_riser", "stair_tread", "lift")
         + ("trunk_height", "stair_trunk_height", "foot_x", "foot_distance", "foot_yaw"),
         given.ranges,
     )
-    still = kind <= SQUAT
     turn, radius = draw["turn_yaw"], draw["turn_radius"]
     arc = jnp.stack([radius * jnp.sin(jnp.abs(turn)), jnp.sign(turn) * radius * (1 - jnp.cos(turn)), turn])
     zero = jnp.float32(0)
@@ -177,50 +222,56 @@ def begin(key: Array, given: Distribution, ankle_height: float) -> tuple[Task, N
             jnp.stack([draw["stair_tread"], zero, zero]),
         ]
     )
-    down = u[1] < given.down_share
-    on_stairs = kind == STAIRS
+    # the leading foot of a sidle is the one on the side it goes to
+    first = jnp.where(kind == SIDLE, (draw["sidle_step"] < 0).astype(jnp.int32), (u[1] < 0.5).astype(jnp.int32))
+    height = _choose(kind == STAIRS, draw["stair_trunk_height"], draw["trunk_height"])
+    return Motion(kind, advances[kind], first, draw["period"], draw["lift"], height), draw
+
+
+def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
+    """A new episode's task and the nodes it starts from."""
+    key_motion, key_task, key_posture, key_mix = jax.random.split(key, 4)
+    motion, draw = _motion(key_motion, given, level=False)
+    u: Array = jax.random.uniform(key_task, (5,))
+    still, on_stairs = motion.kind <= SQUAT, motion.kind == STAIRS
+    down = u[0] < given.down_share
     rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
     stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))
-
-    # the leading foot of a sidle is the one on the side it goes to
-    first = jnp.where(kind == SIDLE, (draw["sidle_step"] < 0).astype(jnp.int32), (u[2] < 0.5).astype(jnp.int32))
-    holds = u[3] < given.hold_share
-    hold_after = jnp.floor(_within(u[4], given.hold_after + jnp.array([0.0, 1.0])))
-    height = _choose(on_stairs, draw["stair_trunk_height"], draw["trunk_height"])
+    hold_after = jnp.floor(_within(u[2], given.hold_after + jnp.array([0.0, 1.0])))
     task = Task(
-        kind=kind,
-        advance=advances[kind],
-        first=first,
-        period=draw["period"],
-        lift=draw["lift"],
-        trunk_height=height,
+        motion=motion,
         stairs=stairs,
-        hold_after=jnp.where(holds, hold_after, 1e6).astype(jnp.int32),
+        hold_after=jnp.where(u[1] < given.hold_share, hold_after, 1e6).astype(jnp.int32),
+        mixes=(u[3] < given.mix_share) & ~on_stairs,
+        key=key_mix,
+        push=jnp.where(u[4] < given.push_share, given.ranges["push"][1], 0.0),
     )
 
     distance = jnp.where(still, draw["foot_distance"], FOOT_DISTANCE)
     ahead = jnp.where(still, draw["foot_x"], 0.0)
     side = jnp.array([0.5, -0.5])
-    ankles = jnp.stack([side * ahead, side * distance, jnp.full(2, ankle_height + stairs.height)], axis=-1)
+    ankles = jnp.stack([side * ahead, side * distance, jnp.full(2, robot.ankle_height + stairs.height)], axis=-1)
     yaws = jnp.where(still, draw["foot_yaw"] * 2 * side, jnp.zeros(2))
-    posture_position, posture_orientation = _posture(_draw(key_posture, _POSTURE, given.ranges), ankles, yaws, ankle_height)
-    upright = ankles.mean(axis=0) + jnp.array([0.0, 0.0, 1.0]) * (height - ankle_height)
-    return task, Nodes(
-        trunk_position=jnp.where(still, posture_position, upright),
-        trunk_orientation=jnp.where(still, posture_orientation, jnp.array([1.0, 0, 0, 0])),
-        ankle_positions=ankles,
-        ankle_yaws=yaws,
-    )
+    posture = _drawn_posture(_draw(key_posture, _POSTURE, given.ranges))
+    posture = jax.tree.map(functools.partial(jnp.where, still), posture, _upright(motion.trunk_height))
+    return task, _over_feet(posture, ankles, yaws, robot)
 
 
-def _foothold(task: Task, index: Array, advance: Array, start: Nodes) -> tuple[Array, Array]:
+def _present(given: Distribution, task: Task, index: Array) -> Motion:
+    """The motion of task step `index`."""
+    another, _ = _motion(jax.random.fold_in(task.key, index // MIX_STEPS), given, level=True)
+    mixes = task.mixes & (index >= MIX_STEPS)
+    return jax.tree.map(lambda new, old: jnp.where(mixes, new, old), another, task.motion)
+
+
+def _foothold(motion: Motion, rise: Array, index: Array, advance: Array, start: Nodes) -> tuple[Array, Array]:
     """The end positions (2, 3) and yaws (2,) of both ankles: the swing foot beside the stance foot, moved on."""
-    swing = (index + task.first) % 2
+    swing = (index + motion.first) % 2
     stance = 1 - swing
     side = jnp.array([0.5, -0.5]) * FOOT_DISTANCE
     position, yaw = start.ankle_positions[stance], start.ankle_yaws[stance]
     # when a sidle closes up, the place of the feet stays where the leading foot has put it
-    closes = (task.kind == SIDLE) & (index % 2 == 1)
+    closes = (motion.kind == SIDLE) & (index % 2 == 1)
     advance = jnp.where(closes, 0.0, advance)
     new_yaw = yaw + advance[2]
     c, s = jnp.cos(yaw), jnp.sin(yaw)
@@ -228,7 +279,7 @@ def _foothold(task: Task, index: Array, advance: Array, start: Nodes) -> tuple[A
     # stance foot -> middle of the place -> moved on -> swing foot
     x = s * side[stance] + c * advance[0] - s * advance[1] - s2 * side[swing]
     y = -c * side[stance] + s * advance[0] + c * advance[1] + c2 * side[swing]
-    foothold = position + jnp.stack([x, y, task.stairs.rise])
+    foothold = position + jnp.stack([x, y, rise])
     mine = jnp.arange(2) == swing
     return (
         jnp.where(mine[:, None], foothold, start.ankle_positions),
@@ -240,47 +291,30 @@ def _choose(condition: Array, new: Array, old: Array) -> Array:
     return jnp.where(condition, new, old)
 
 
-def next_step(
-    key: Array,
-    given: Distribution,
-    task: Task,
-    index: Array,
-    start: Nodes,
-    ankle_height: float,
-    timestep: float,
-) -> TaskStep:
-    """Task step number `index` of an episode, from where the last one ended; its period is a multiple of timestep, s."""
+def next_step(key: Array, given: Distribution, task: Task, index: Array, start: Nodes, robot: Robot) -> TaskStep:
+    """Task step number `index` of an episode, from where the last one ended; of a whole number of control periods."""
     key_step, key_curve, key_posture = jax.random.split(key, 3)
+    motion = _present(given, task, index)
     hold = index >= task.hold_after
-    squats = (task.kind == SQUAT) & ~hold
-    steps = (task.kind >= WALK) & ~hold
+    squats = (motion.kind == SQUAT) & ~hold
+    steps = (motion.kind >= WALK) & ~hold
 
     vary = jax.random.uniform(key_step, (3,))
     vary = _within(vary, given.ranges["step_variation"])
     bounds = given.ranges["period"]
-    period = jnp.where(steps, jnp.clip(task.period * vary[0], bounds[0], bounds[1]), 1.0)
-    advance = jnp.where(task.kind == STAIRS, task.advance, task.advance * vary[2])
+    period = jnp.where(steps, jnp.clip(motion.period * vary[0], bounds[0], bounds[1]), 1.0)
+    advance = jnp.where(motion.kind == STAIRS, motion.advance, motion.advance * vary[2])
 
-    footholds, headings = _foothold(task, index, advance, start)
+    footholds, headings = _foothold(motion, task.stairs.rise, index, advance, start)
     ankles = _choose(steps, footholds, start.ankle_positions)
     yaws = _choose(steps, headings, start.ankle_yaws)
-    over_feet = ankles.mean(axis=0) + jnp.array([0.0, 0.0, 1.0]) * (task.trunk_height - ankle_height)
     draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric"), given.ranges)
-    posture_position, posture_orientation = _posture(draw, ankles, yaws, ankle_height)
     period = jnp.where(squats, draw["squat_period"], period)
-
-    end = Nodes(
-        trunk_position=_choose(steps, over_feet, _choose(squats, posture_position, start.trunk_position)),
-        trunk_orientation=_choose(
-            steps,
-            rotations.from_yaw(yaws.mean()),
-            _choose(squats, posture_orientation, start.trunk_orientation),
-        ),
-        ankle_positions=ankles,
-        ankle_yaws=yaws,
-    )
-    swing = jnp.where(steps, (jnp.arange(2) == (index + task.first) % 2).astype(jnp.float32), 0.0)
-    lift = swing * task.lift * vary[1]
+    posture = jax.tree.map(functools.partial(jnp.where, squats), _drawn_posture(draw), _upright(motion.trunk_height))
+    moves = functools.partial(jnp.where, squats | steps)
+    end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
+    swing = jnp.where(steps, (jnp.arange(2) == (index + motion.first) % 2).astype(jnp.float32), 0.0)
+    lift = swing * motion.lift * vary[1]
     u = jax.random.uniform(key_curve, (2, 3))
     points = planner.swing_points(
         start.ankle_positions,
@@ -292,12 +326,12 @@ def next_step(
     return TaskStep(
         start=start,
         end=end,
-        period=jnp.round(period / timestep) * timestep,
+        period=jnp.round(period / robot.timestep) * robot.timestep,
         swing=swing,
         ankle_points=points,
         lift=lift,
         # a trigonometric curve rises above its chord, which passes through the tread between two others
-        trigonometric=((draw["trigonometric"] > 0) & (task.kind != STAIRS)).astype(jnp.float32),
+        trigonometric=((draw["trigonometric"] > 0) & (motion.kind != STAIRS)).astype(jnp.float32),
     )
 
 
@@ -307,14 +341,15 @@ def stair_window(given: Distribution, task: Task, index: Array) -> Array:
 
 
 class Source(NamedTuple):
-    """Where an environment's task steps come from: three pure functions of whatever data an episode is given."""
+    """Where an environment's task steps come from: four pure functions of whatever data an episode is given."""
 
-    begin: Callable[..., tuple[Any, Nodes]]  # (key, given, ankle height) -> task, first nodes
-    next_step: Callable[..., TaskStep]  # (key, given, task, index, start, ankle height, timestep)
+    begin: Callable[..., tuple[Any, Nodes]]  # (key, given, robot) -> task, first nodes
+    next_step: Callable[..., TaskStep]  # (key, given, task, index, start, robot)
     boxes: Callable[..., Array]  # (given, task, index) -> (number of boxes, 7) poses
+    push: Callable[..., Array]  # (given, task) -> () N s, the greatest impulse of a push
 
 
-RANDOM = Source(begin, next_step, stair_window)
+RANDOM = Source(begin, next_step, stair_window, lambda given, task: task.push)
 
 
 def tracking_errors(errors: nodes.NodeErrors) -> dict[str, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import pathlib
 import signal
 import sys
@@ -16,6 +17,7 @@ from bipedtrack.messages import fail, quiet_imports
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
 EVALUATION_DIFFICULTY = 0.5
+_ROBOTS_A_CORE = 200  # fewer do not pay for a device of their own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Train:
     """Goes on with the run in the run directory, with its own curriculum and seed."""
     device: Literal["cpu", "gpu", "auto"] = "auto"
     """Where to train; never falls back silently. auto: the best that JAX finds."""
+    devices: int = 0
+    """How many local devices share the robots. 0: all accelerators, or on the CPU one for each core that has work enough."""
 
 
 def main() -> None:
@@ -55,40 +59,63 @@ class DeviceError(RuntimeError):
     """The wanted device is not there; the message is one line."""
 
 
-def use_device(device: str) -> str:
-    """Makes JAX use a device and returns its description. Raises DeviceError where it is missing."""
+def use_devices(device: str, count: int, ppo: curriculum.PpoConfig) -> tuple[int, str]:
+    """Makes JAX use devices; returns how many share the robots, and their description.
+
+    device: cpu, gpu or auto; count: as `Train.devices`. A CPU counts as one device for each of its cores that gets a few
+    hundred robots: XLA runs much of a step on one thread, so that two devices on two cores are faster than one on both.
+    Raises DeviceError where they are missing, ConfigError where the robots cannot be shared out evenly.
+    """
     import jax
 
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.CRITICAL)
     if device != "auto":
         jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
+    jax.config.update("jax_num_cpu_devices", count or _cores_with_work(ppo))
     try:
-        devices = jax.devices()
+        found = jax.local_devices()
     except (RuntimeError, AssertionError) as error:  # an assertion where JAX has no build for the platform at all
         reason = (str(error) or "no such back end").splitlines()[0]
         raise DeviceError(
             f"--device {device}: JAX finds no such device ({reason}); use --device cpu, or "
             "`pip install bipedtrack[cuda]` on a machine with an NVIDIA GPU"
         ) from None
-    return f"{len(devices)} x {devices[0].device_kind}"
+    count = count or len(found)
+    if count > len(found):
+        raise DeviceError(f"--devices {count}: there are {len(found)} of kind {found[0].device_kind}")
+    if not ppo.shares_out(count):
+        raise config.ConfigError(
+            f"--devices {count}: num_envs ({ppo.num_envs}) must be a multiple of the devices times num_minibatches "
+            f"({ppo.num_minibatches})"
+        )
+    return count, f"{count} x {found[0].device_kind}"
+
+
+def _cores_with_work(ppo: curriculum.PpoConfig) -> int:
+    """The greatest number of cores that share the robots evenly with at least _ROBOTS_A_CORE each; at least 1."""
+    most = min(len(os.sched_getaffinity(0)), ppo.num_envs // _ROBOTS_A_CORE)
+    return next((count for count in range(most, 1, -1) if ppo.shares_out(count)), 1)
 
 
 def run(options: Train) -> None:
     """Trains, exports and shows the table."""
     if options.seed < 0:
         raise config.ConfigError(f"--seed {options.seed}: must not be negative")
-    device = use_device(options.device)
+    if options.devices < 0:
+        raise config.ConfigError(f"--devices {options.devices}: must not be negative")
     folder = options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
     if options.resume:
         directory = checkpoint.RunDirectory.open(folder)
-        plan, seed = curriculum.of_run(directory)
+        plan, seed, devices = curriculum.of_run(directory)
+        devices, description = use_devices(options.device, options.devices or devices, plan.ppo)
     else:
         plan, seed = curriculum.load(options.curriculum), options.seed
         plan.substeps(robot.load(plan.robot).timestep)
-        settings = {"curriculum": config.to_dict(plan), "seed": seed, "versions": _versions()}
+        devices, description = use_devices(options.device, options.devices, plan.ppo)
+        settings = {"curriculum": config.to_dict(plan), "seed": seed, "devices": devices, "versions": _versions()}
         directory = checkpoint.RunDirectory.create(folder, settings)
     try:
-        _train(directory, plan, seed, device, options)
+        _train(directory, plan, seed, devices, description)
     finally:
         directory.close()
 
@@ -97,7 +124,9 @@ def _versions() -> dict[str, str | None]:
     return {row.name: row.found for row in versions.check()}
 
 
-def _train(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed: int, device: str, options: Train) -> None:
+def _train(
+    directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed: int, devices: int, description: str
+) -> None:
     import rich.console
 
     with quiet_imports():
@@ -112,12 +141,12 @@ def _train(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed
         for warning in directory.warnings:
             progress.say(f"warning: {warning}")
         progress.say(
-            f"{plan.name}, seed {seed}, on {device}: {len(plan.stages)} stages, {len(calls)} PPO calls, "
+            f"{plan.name}, seed {seed}, on {description}: {len(plan.stages)} stages, {len(calls)} PPO calls, "
             f"{sum(call.steps for call in calls) / 1e6:.1f} M policy steps, in {directory.path}"
             + (f"; {finished} calls are done" if finished else "")
         )
         try:
-            params = training.train(plan, directory, seed, progress, stop)
+            params = training.train(plan, directory, seed, devices, progress, stop)
         except training.Stopped:
             saved = directory.latest()
             progress.say(

@@ -37,7 +37,15 @@ class Stopped(Exception):
 
 def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, difficulty: float) -> env.TrackingEnv:
     """The environment of a stage at a difficulty; only a stage with stairs has boxes."""
-    given = tasks.distribution(config.ranges, stage.shares, difficulty, stage.hold_share, stage.hold_after)
+    given = tasks.distribution(
+        config.ranges,
+        stage.shares,
+        difficulty,
+        stage.hold_share,
+        stage.hold_after,
+        mix_share=stage.mix_share,
+        push_share=stage.push_share,
+    )
     settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
     return env.TrackingEnv(robot.load(config.robot), settings, given)
 
@@ -46,6 +54,7 @@ def train(
     config: curriculum.Curriculum,
     run: RunDirectory,
     seed: int,
+    devices: int,
     progress: Progress,
     wants_to_stop: Callable[[], bool],
 ) -> Params:
@@ -56,7 +65,7 @@ def train(
     found = run.latest()
     params = None if found is None else from_arrays(config, found[1])
     for call in curriculum.calls(config)[0 if found is None else found[0] + 1 :]:
-        params = _run_call(config, call, seed, params, progress, wants_to_stop)
+        params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
         run.save_checkpoint(call.index, to_arrays(params), {"seed": seed})
         progress.finished(call)
         jax.clear_caches()  # a call's programs serve no other call, and each holds hundreds of megabytes
@@ -67,12 +76,13 @@ def _run_call(
     config: curriculum.Curriculum,
     call: curriculum.Call,
     seed: int,
+    devices: int,
     params: Params | None,
     progress: Progress,
     wants_to_stop: Callable[[], bool],
 ) -> Params:
     """One `ppo.train` from the given parameters. Steps are rounded up to whole epochs of whole updates."""
-    ppo_config, network = config.ppo, config.network
+    ppo_config = config.ppo
     updates = math.ceil(call.steps / ppo_config.steps_per_update)
     epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
     the_env = make_env(config, call.stage, call.lesson.difficulty)
@@ -94,43 +104,52 @@ def _run_call(
             raise Stopped
 
     progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
-    with _compiled_once():
+    with compiled_once():
         _, params, _ = ppo.train(
             environment=autoreset.AutoReset(the_env, config.episode_length),
-            wrap_env=False,
-            # never evaluated, yet brax compiles its reset: the cheapest one there is
-            eval_env=brax.envs.get_environment("fast"),
             num_timesteps=updates * ppo_config.steps_per_update,
             num_evals=epochs + 1,
-            run_evals=False,
-            episode_length=config.episode_length,
-            num_envs=ppo_config.num_envs,
-            unroll_length=ppo_config.unroll_length,
-            batch_size=ppo_config.num_envs // ppo_config.num_minibatches,
-            num_minibatches=ppo_config.num_minibatches,
-            num_updates_per_batch=ppo_config.num_epochs,
-            learning_rate=call.learning_rate,
-            entropy_cost=call.entropy_cost,
-            clipping_epsilon=call.clipping_epsilon,
-            discounting=ppo_config.discount,
-            gae_lambda=ppo_config.gae_lambda,
-            max_grad_norm=ppo_config.max_grad_norm,
-            reward_scaling=ppo_config.reward_scaling,
-            normalize_observations=True,
-            normalize_observations_std_eps=network.normalizer_floor,
-            network_factory=functools.partial(make_networks, network),
             seed=call_seed(seed, call.index),
+            max_devices_per_host=devices,
             restore_params=params,
-            log_training_metrics=True,
-            training_metrics_steps=5 * ppo_config.steps_per_update,
             progress_fn=report,
             policy_params_fn=look,
+            **ppo_arguments(config, call),
         )
     return params
 
 
+def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[str, Any]:
+    """What brax's `ppo.train` is told beside the environment, how long and from where: the only place with its names."""
+    ppo_config, network = config.ppo, config.network
+    return {
+        "wrap_env": False,
+        # never evaluated, yet brax compiles its reset: the cheapest one there is
+        "eval_env": brax.envs.get_environment("fast"),
+        "run_evals": False,
+        "episode_length": config.episode_length,
+        "num_envs": ppo_config.num_envs,
+        "unroll_length": ppo_config.unroll_length,
+        "batch_size": ppo_config.num_envs // ppo_config.num_minibatches,
+        "num_minibatches": ppo_config.num_minibatches,
+        "num_updates_per_batch": ppo_config.num_epochs,
+        "learning_rate": call.learning_rate,
+        "entropy_cost": call.entropy_cost,
+        "clipping_epsilon": call.clipping_epsilon,
+        "discounting": ppo_config.discount,
+        "gae_lambda": ppo_config.gae_lambda,
+        "max_grad_norm": ppo_config.max_grad_norm,
+        "reward_scaling": ppo_config.reward_scaling,
+        "normalize_observations": True,
+        "normalize_observations_std_eps": network.normalizer_floor,
+        "network_factory": functools.partial(make_networks, network),
+        "log_training_metrics": True,
+        "training_metrics_steps": 5 * ppo_config.steps_per_update,
+    }
+
+
 @contextlib.contextmanager
-def _compiled_once() -> Iterator[None]:
+def compiled_once() -> Iterator[None]:
     """Brax's first training state gets the sharding of all later ones, so that the epoch compiles once and not twice.
 
     `jax.device_put_replicated`, which brax calls for the first state, differs from `jax.pmap`, whose output the later

@@ -58,11 +58,11 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
 
     def one(key: Any, given: tasks.Distribution) -> tuple:
         key_begin, key_steps = jax.random.split(key)
-        task, start = tasks.begin(key_begin, given, robot.ankle_height)
+        task, start = tasks.begin(key_begin, given, robot)
 
         def following(start: Any, indexed_key: Any) -> tuple:
             index, key = indexed_key
-            step = tasks.next_step(key, given, task, index, start, robot.ankle_height, robot.timestep)
+            step = tasks.next_step(key, given, task, index, start, robot)
             times = jnp.linspace(0, 1, instants) * step.period
             return step.end, (step, times, jax.vmap(planner.command, (None, 0))(step, times))
 
@@ -75,7 +75,7 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
         shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
         hold_share = 0.0 if hold_after is None else 1.0
         given = tasks.distribution(curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8))
-        keys = jax.random.split(jax.random.key(tasks.KINDS.index(kind)), count)
+        keys = jax.random.split(jax.random.PRNGKey(tasks.KINDS.index(kind)), count)
         return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
 
     return draw

@@ -244,6 +244,7 @@ SETTINGS = {
     "curriculum a word": damage(curriculum="smoke"),
     "no curriculum": damage(curriculum=None),
     "no seed": damage(seed=None),
+    "devices a word": damage(devices="two"),
     "a list": lambda content: "[]",
 }
 

@@ -71,16 +71,16 @@ def laid(robot: Robot, unoptimised: None) -> Laid:
         return tasks.distribution(tasks.Ranges(), shares, 1.0, float(hold is not None), after, down)
 
     given = jax.tree.map(lambda *leaves: np.stack(leaves), *(distribution(*case) for case in CASES.values()))
-    keys = jax.random.split(jax.random.key(3), len(CASES))
+    keys = jax.random.split(jax.random.PRNGKey(3), len(CASES))
     draw = jax.jit(jax.vmap(lambda key, given: plans.random_plan(key, given, robot, STEPS)))
     plan = jax.tree.map(np.asarray, draw(keys, given))
 
-    begin = jax.jit(jax.vmap(lambda key, given: tasks.begin(key, given, robot.ankle_height)))
+    begin = jax.jit(jax.vmap(lambda key, given: tasks.begin(key, given, robot)))
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, 0, 0, None, 0))
     def following(key: Any, given: Any, task: Any, index: Any, start: Any) -> Any:
-        step = tasks.next_step(key, given, task, index, start, robot.ankle_height, robot.timestep)
+        step = tasks.next_step(key, given, task, index, start, robot)
         return step, tasks.stair_window(given, task, index)
 
     for_steps, for_begin = jax.vmap(jax.random.split, out_axes=1)(keys)
@@ -233,14 +233,14 @@ def test_an_environment_is_given_the_plan_and_after_its_end_the_last_step(robot:
     plan = script_plan(footsteps.parse(HEADER + BOXES + SCRIPT, robot, "a.csv"))
     plan = plan._replace(boxes=plan.boxes + np.arange(5)[:, None, None])  # so that they tell the task steps apart
     plan = jax.tree.map(jax.numpy.asarray, plan)
-    task, first = PLANNED.begin(jax.random.key(0), plan, robot.ankle_height)
+    task, first = PLANNED.begin(jax.random.PRNGKey(0), plan, robot)
     np.testing.assert_allclose(first.ankle_positions, [[0, 0.1, 0.04], [0, -0.1, 0.04]], atol=1e-6)
     np.testing.assert_allclose(first.trunk_position, [0, 0, 0.75], atol=1e-6)
 
     @jax.jit
     def following(index: Any) -> Any:
-        key = jax.random.key(0)
-        step = PLANNED.next_step(key, plan, task, index, first, robot.ankle_height, robot.timestep)
+        key = jax.random.PRNGKey(0)
+        step = PLANNED.next_step(key, plan, task, index, first, robot)
         return step, PLANNED.boxes(plan, task, index)
 
     for index, number in [(0, 0), (1, 1), (3, 3), (4, 4), (5, 4), (1000, 4)]:

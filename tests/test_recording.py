@@ -353,7 +353,7 @@ def test_without_feedforward_joint_targets_stay_in_mjx_too(first: policy.Policy,
         state = one.begin(jax.random.PRNGKey(0), given)
 
         def tick(memory: Any, _: None) -> Any:
-            (_, memory), answer = one.control_step(state.pipeline_state, memory, jnp.zeros(12))
+            (_, memory), answer = one.control_step(state.pipeline_state, memory, one.look_ahead(memory)[1], jnp.zeros(12))
             return memory, (one.command(memory).target.ankle_positions, answer.joint_targets)
 
         return state.pipeline_state.qpos[7:], jax.lax.scan(tick, state.info["episode"], length=60)[1]

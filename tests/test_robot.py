@@ -273,6 +273,8 @@ def test_constants_of_the_robot(robot: Robot) -> None:
     for found, column in ((robot.kp, 2), (robot.kd, 3), (robot.torque_limit, 4)):
         assert found == pytest.approx([row[column] for row in JOINTS.values()] * 2)
     assert robot.feedback_ratio == pytest.approx([0.3] * 12)
+    assert robot.masses == pytest.approx([20, 6.4, 2, 1])
+    assert robot.centres == pytest.approx([0.2, 0.175, 0.028])
     assert robot.timestep == 0.005
 
 
