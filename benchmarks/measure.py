@@ -1,4 +1,4 @@
-"""What every benchmark needs: timing of jitted functions, limits of the machine, one JSON line a case."""
+"""What every benchmark needs: devices, timing of jitted functions, limits of the machine, one JSON line a case."""
 
 from __future__ import annotations
 
@@ -13,23 +13,33 @@ import jax
 import jax.numpy as jnp
 
 
+def use_devices(count: int) -> int:
+    """Makes the CPU count as so many devices, 0: one for each core; returns how many local devices there are.
+
+    Must come before anything else of JAX.
+    """
+    jax.config.update("jax_num_cpu_devices", count or len(os.sched_getaffinity(0)))
+    return jax.local_device_count()
+
+
 def line(**fields: Any) -> dict[str, Any]:
     """Prints a case as one JSON line, floats to four digits, and returns it."""
+    device = jax.devices()[0]
+    machine = {"device": device.device_kind, "devices": jax.local_device_count(), "cores": os.cpu_count()}
     rounded = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in fields.items()}
-    print(json.dumps(rounded), flush=True)
+    print(json.dumps(rounded | machine | {"system": platform.machine()}), flush=True)
     return rounded
 
 
-def machine() -> dict[str, Any]:
-    """The device, its name and how many cores there are."""
-    device = jax.devices()[0]
-    return {"device": device.platform, "kind": device.device_kind, "cores": os.cpu_count(), "system": platform.machine()}
+def shared_out(tree: Any, devices: int) -> Any:
+    """A batch of robots (n, ...) as (devices, n / devices, ...)."""
+    return jax.tree.map(lambda leaf: leaf.reshape(devices, -1, *leaf.shape[1:]), tree)
 
 
 def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Callable[..., Any], float]:
-    """A function compiled for its arguments, and the seconds that took (tracing included, no persistent cache)."""
+    """A function mapped over all devices (the arguments' first axis), compiled, and the seconds that took with tracing."""
     began = time.perf_counter()
-    made = jax.jit(function).lower(*arguments).compile()
+    made = jax.pmap(function).lower(*arguments).compile()
     return made, time.perf_counter() - began
 
 
@@ -45,7 +55,8 @@ def seconds_of(run: Callable[[], Any], repeats: int = 3) -> float:
 
 
 def matrix_limit(dtype: Any = jnp.float32, size: int = 2048, repeats: int = 8) -> float:
-    """Floating point operations per second of a product of two square matrices, the most that a network can reach."""
-    a = jnp.ones((size, size), dtype)
-    product, _ = compiled(lambda a, b: jnp.matmul(a, b, preferred_element_type=jnp.float32), a, a)
-    return 2 * size**3 / seconds_of(lambda: product(a, a), repeats)
+    """Floating point operations per second of products of square matrices on all devices: a network can have no more."""
+    devices = jax.local_device_count()
+    a = jnp.ones((devices, size, size), dtype)
+    product, _ = compiled(lambda a: jnp.matmul(a, a, preferred_element_type=jnp.float32), a)
+    return devices * 2 * size**3 / seconds_of(lambda: product(a), repeats)

@@ -1,6 +1,6 @@
 """How fast robots are simulated: MuJoCo C, MJX alone, and the whole environment with policy and auto-reset.
 
-python benchmarks/rollout.py --robots 64 512 2048
+python benchmarks/rollout.py --robots 64 640 2048
 
 All rates are physics steps of 0.005 s per second, with the MJCF's own solver. `ratio` is to MuJoCo C on all cores for
 MJX, and to MJX alone with as many robots for the environment, both measured in the same run.
@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,104 +20,117 @@ import mujoco.rollout
 import numpy as np
 import tyro
 
-from bipedtrack import autoreset, curriculum, policy, robot, terrain, training
+from bipedtrack import autoreset, curriculum, policy, robot, training
 from bipedtrack.env import TrackingEnv
 
-POLICY = "models/policies/first.npz"
-SECONDS = 0.5  # simulated before anything is timed, so that feet are on the ground and robots differ
+_WARM_UP = 0.5  # s simulated before anything is timed, so that feet are on the ground and robots differ
 
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
     """Rates of MuJoCo C, MJX and the environment over the number of robots."""
 
-    robots: tuple[int, ...] = (64, 256, 512, 640, 1024, 2048, 4096, 8192)
+    robots: tuple[int, ...] = (64, 256, 640, 1024, 2048, 4096, 8192)
     """Numbers of robots."""
     steps: int = 200
     """Physics steps of each robot that are timed at once."""
-    policy: str = POLICY
-    """The policy that acts; its observations keep the robots at a usual task."""
+    policy: str = "models/policies/first.npz"
+    """The policy that acts, so that the robots do what they usually do."""
     stairs: bool = True
-    """Also the environment with stairs."""
+    """Also on stairs, which cost three boxes."""
+    devices: int = 0
+    """Devices that the CPU counts as; 0: one for each core."""
 
 
-def mujoco_c(model: Any, threads: int, robots: int, steps: int) -> float:
-    """Physics steps per second of MuJoCo C on robots that stand under constant joint targets."""
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
-    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    states = np.tile(state, (robots, 1))
-    targets = np.tile(data.ctrl, (robots, steps, 1)) + _wobble(robots, steps, model.nu)
-    datas = [mujoco.MjData(model) for _ in range(threads)]
-    with mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
-        seconds = measure.seconds_of(lambda: pool.rollout(model, datas, states, targets)[0])
-    return robots * steps / seconds
+class Rate(NamedTuple):
+    """What was measured of a case."""
+
+    rate: float  # physics steps per second
+    compile_s: float
+    bytes_a_robot: float  # of the state that is carried from step to step
 
 
-def _wobble(robots: int, steps: int, joints: int) -> np.ndarray:
-    """Joint targets' deviations, rad: slow, small and different for each robot."""
+def wobble(robots: int, steps: int, joints: int) -> np.ndarray:
+    """Joint targets' deviations (robots, steps, joints), rad: slow, small and different for each robot."""
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (robots, 1, joints))
     return 0.05 * np.sin(2 * np.pi * 1.5 * 0.005 * np.arange(steps)[None, :, None] + phase)
 
 
-def mjx_alone(the_env: TrackingEnv, robots: int, steps: int) -> tuple[float, float]:
-    """Physics steps per second of MJX on the same robots and targets, and the seconds of compiling."""
-    state = jax.jit(jax.vmap(the_env.reset))(jax.random.split(jax.random.PRNGKey(0), robots))
-    physics = state.pipeline_state
-    targets = physics.qpos[None, :, 7:] + jnp.asarray(_wobble(robots, steps, 12).swapaxes(0, 1), jnp.float32)
+def mujoco_c(model: Any, threads: int, robots: int, steps: int) -> float:
+    """Physics steps per second of MuJoCo C on robots that stand under wobbling joint targets."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    targets = data.ctrl + wobble(robots, steps, model.nu)
+    datas = [mujoco.MjData(model) for _ in range(threads)]
+    with mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
+        seconds = measure.seconds_of(lambda: pool.rollout(model, datas, np.tile(state, (robots, 1)), targets)[0])
+    return robots * steps / seconds
+
+
+def _begun(begin: Any, robots: int, devices: int) -> Any:
+    """First states of robots, shared out over the devices."""
+    return jax.pmap(begin)(measure.shared_out(jax.random.split(jax.random.PRNGKey(0), robots), devices))
+
+
+def _bytes(tree: Any, robots: int) -> float:
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) / robots
+
+
+def mjx_alone(the_env: TrackingEnv, robots: int, steps: int, devices: int) -> Rate:
+    """MJX on robots that stand under the same wobbling joint targets."""
+    physics = _begun(jax.vmap(the_env.reset), robots, devices).pipeline_state
+    deviations = measure.shared_out(jnp.asarray(wobble(robots, steps, 12), jnp.float32), devices).swapaxes(1, 2)
+    targets = physics.qpos[:, None, :, 7:] + deviations
 
     def run(physics: Any, targets: Any) -> Any:
-        step = lambda carry, ctrl: (jax.vmap(the_env.simulate)(carry, ctrl), None)  # noqa: E731
-        return jax.lax.scan(step, physics, targets)[0]
+        simulate = jax.vmap(lambda physics, ctrl: the_env.simulate(physics, ctrl, jnp.zeros(3)))
+        return jax.lax.scan(lambda carry, ctrl: (simulate(carry, ctrl), None), physics, targets)[0]
 
     made, compiling = measure.compiled(run, physics, targets)
-    return robots * steps / measure.seconds_of(lambda: made(physics, targets)), compiling
+    return Rate(robots * steps / measure.seconds_of(lambda: made(physics, targets)), compiling, _bytes(physics, robots))
 
 
-def environment(the_env: TrackingEnv, driven: policy.Policy, robots: int, steps: int) -> tuple[float, float, float]:
-    """Physics steps per second of planner, kinematics, network, MJX, rewards and auto-reset; compile s; bytes a robot."""
+def environment(the_env: TrackingEnv, driven: policy.Policy | None, robots: int, steps: int, devices: int) -> Rate:
+    """Planner, kinematics, MJX, rewards and auto-reset, and the network of a policy where one is given."""
     wrapped = autoreset.AutoReset(the_env, 500)
-    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), robots))
-
-    def run(state: Any, length: int) -> Any:
-        def step(state: Any, _: None) -> tuple[Any, None]:
-            return wrapped.step(state, policy.apply(driven.network, driven.activation, state.obs)), None
-
-        return jax.lax.scan(step, state, length=length)[0]
-
+    state = _begun(wrapped.reset, robots, devices)
     length = max(1, steps // the_env.substeps)
-    made, compiling = measure.compiled(lambda state: run(state, length), state)
-    for _ in range(max(1, round(SECONDS / (length * the_env.substeps * the_env.robot.timestep)))):
+
+    def step(state: Any, _: None) -> tuple[Any, None]:
+        if driven is None:
+            return wrapped.step(state, jnp.zeros((len(state.obs), 12))), None
+        return wrapped.step(state, policy.apply(driven.network, driven.activation, state.obs)), None
+
+    made, compiling = measure.compiled(lambda state: jax.lax.scan(step, state, length=length)[0], state)
+    for _ in range(max(1, round(_WARM_UP / (length * the_env.config.policy_period)))):
         state = made(state)
-    carried = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / robots
-    return robots * length * the_env.substeps / measure.seconds_of(lambda: made(state)), compiling, carried
+    rate = robots * length * the_env.substeps / measure.seconds_of(lambda: made(state))
+    return Rate(rate, compiling, _bytes(state, robots))
 
 
 def main(options: Rollout) -> None:
     """Prints a line for every case."""
+    devices = measure.use_devices(options.devices)
     driven = policy.load(options.policy, robot.load())
-    plan = curriculum.load("quick")
+    plan = curriculum.load("standard")
     plan = dataclasses.replace(plan, control=driven.settings, policy_period=driven.policy_period)
-    flat, stairs = plan.stages[0], plan.stages[1]
-    common = {"benchmark": "rollout", **measure.machine()}
     model = robot.build_model(driven.robot.name)
-    rates = {}
+    limit = 0.0
     for threads in dict.fromkeys((1, os.cpu_count() or 1)):
-        rates[threads] = mujoco_c(model, threads, 256, options.steps)
-        measure.line(**common, case="MuJoCo C", threads=threads, robots=256, rate=rates[threads])
-    limit = max(rates.values())
-    grounds: Sequence[tuple[str, Any]] = [("flat", flat), *([("stairs", stairs)] if options.stairs else [])]
-    for name, stage in grounds:
-        the_env = training.make_env(plan, stage, 0.5)
-        boxes = terrain.STAIR_BOXES if stage.shares.stairs else 0
+        rate = mujoco_c(model, threads, 256, options.steps)
+        limit = max(limit, rate)
+        measure.line(benchmark="rollout", case="MuJoCo C", threads=threads, robots=256, rate=rate)
+    grounds = {"flat": plan.stages[0], "stairs": plan.stages[1]}
+    for ground in ("flat", "stairs") if options.stairs else ("flat",):
+        the_env = training.make_env(plan, grounds[ground], 0.5)
         for robots in options.robots:
-            sizes = {"ground": name, "boxes": boxes, "robots": robots, "steps": options.steps}
-            alone, compiling = mjx_alone(the_env, robots, options.steps)
-            measure.line(**common, case="MJX", **sizes, compile_s=compiling, rate=alone, ratio=alone / limit)
-            whole, compiling, carried = environment(the_env, driven, robots, options.steps)
-            found = {"compile_s": compiling, "rate": whole, "ratio": whole / alone, "bytes_a_robot": carried}
-            measure.line(**common, case="environment", **sizes, **found)
+            case = {"benchmark": "rollout", "ground": ground, "robots": robots, "steps": options.steps}
+            alone = mjx_alone(the_env, robots, options.steps, devices)
+            measure.line(**case, case="MJX", **alone._asdict(), ratio=alone.rate / limit)
+            whole = environment(the_env, driven, robots, options.steps, devices)
+            measure.line(**case, case="environment", **whole._asdict(), ratio=whole.rate / alone.rate)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import tyro
 
-from bipedtrack import checkpoint, config, curriculum, robot, versions
+from bipedtrack import checkpoint, compilation, config, curriculum, robot, versions
 from bipedtrack.messages import fail, quiet_imports
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
@@ -101,6 +101,7 @@ def run(options: Train) -> None:
     """Trains, exports and shows the table."""
     if options.seed < 0:
         raise config.ConfigError(f"--seed {options.seed}: must not be negative")
+    compilation.use_cache()
     if options.devices < 0:
         raise config.ConfigError(f"--devices {options.devices}: must not be negative")
     folder = options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"

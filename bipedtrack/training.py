@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -16,12 +17,12 @@ import brax.envs
 import jax
 import numpy as np
 from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import networks
+from brax.training.agents.ppo import losses, networks
 from brax.training.agents.ppo import train as ppo
 from flax import linen
 
 from bipedtrack import __version__, autoreset, curriculum, env, observation, policy, robot, tasks, versions
-from bipedtrack.checkpoint import CheckpointError, RunDirectory, RunError
+from bipedtrack.checkpoint import CheckpointError, RunDirectory
 from bipedtrack.progress import Progress
 
 _UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
@@ -87,24 +88,15 @@ def _run_call(
     epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
     the_env = make_env(config, call.stage, call.lesson.difficulty)
 
-    failures: list[RunError] = []
-
     def report(steps: int, metrics: dict[str, Any]) -> None:
-        # brax also reports after each epoch, without a word on episodes
-        if "episode/length" in metrics:
-            try:
-                progress.update(call, steps, _figures(metrics, config.policy_period))
-            except RunError as error:  # raised here, inside a callback of JAX, it would come out as an error of JAX
-                failures.append(error)
+        progress.update(call, steps, _figures(metrics, config.policy_period))
 
     def look(steps: int, make_policy: Any, params: Any) -> None:
-        if failures:
-            raise failures[0]
         if wants_to_stop():
             raise Stopped
 
     progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
-    with compiled_once():
+    with adapted_brax():
         _, params, _ = ppo.train(
             environment=autoreset.AutoReset(the_env, config.episode_length),
             num_timesteps=updates * ppo_config.steps_per_update,
@@ -143,32 +135,70 @@ def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[
         "normalize_observations": True,
         "normalize_observations_std_eps": network.normalizer_floor,
         "network_factory": functools.partial(make_networks, network),
-        "log_training_metrics": True,
-        "training_metrics_steps": 5 * ppo_config.steps_per_update,
     }
 
 
-@contextlib.contextmanager
-def compiled_once() -> Iterator[None]:
-    """Brax's first training state gets the sharding of all later ones, so that the epoch compiles once and not twice.
+def speed(config: curriculum.Curriculum, call: curriculum.Call, batch: brax.envs.Env, updates: int) -> tuple[float, float]:
+    """Policy steps per second of a PPO call on a batch of environments, on all devices, and the seconds before the first.
 
-    `jax.device_put_replicated`, which brax calls for the first state, differs from `jax.pmap`, whose output the later
-    ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares (brax 0.14.2, jax 0.9.2).
+    Three times `updates` updates are run, as three of brax's epochs; the faster of the last two counts.
     """
-
-    def replicate(x: Any, devices: Sequence[Any]) -> Any:
-        axis = ppo._PMAP_AXIS_NAME
-        sharding = jax.sharding.NamedSharding(
-            jax.sharding.Mesh(np.array(devices), (axis,)), jax.sharding.PartitionSpec(axis)
+    times = [time.perf_counter()]
+    with adapted_brax():
+        ppo.train(
+            environment=batch,
+            num_timesteps=3 * updates * config.ppo.steps_per_update,
+            num_evals=4,
+            seed=0,
+            policy_params_fn=lambda *_: times.append(time.perf_counter()),
+            **ppo_arguments(config, call),
         )
-        return jax.tree.map(lambda leaf: jax.device_put(jax.numpy.stack([leaf] * len(devices)), sharding), x)
+    _, *later = np.diff(times[-4:])
+    fastest = min(later)
+    return updates * config.ppo.steps_per_update / fastest, times[-3] - times[0] - fastest
 
-    original = jax.device_put_replicated
-    jax.device_put_replicated = replicate
+
+@contextlib.contextmanager
+def adapted_brax() -> Iterator[None]:
+    """Brax's `ppo.train` with an epoch that compiles once and that JAX can keep on disk (brax 0.14.2, jax 0.9.2).
+
+    - `jax.device_put_replicated`, which brax calls for the first training state, differs from `jax.pmap`, whose output all
+      later ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares, and the epoch
+      would compile twice.
+    - Brax reports episodes by a callback into Python, and a program with one cannot be kept. Here the loss reports them.
+    """
+    original = jax.device_put_replicated, losses.compute_ppo_loss
+    jax.device_put_replicated, losses.compute_ppo_loss = _replicate, _loss_and_episodes(losses.compute_ppo_loss)
     try:
         yield
     finally:
-        jax.device_put_replicated = original
+        jax.device_put_replicated, losses.compute_ppo_loss = original
+
+
+def _replicate(x: Any, devices: Sequence[Any]) -> Any:
+    axis = ppo._PMAP_AXIS_NAME
+    sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), (axis,)), jax.sharding.PartitionSpec(axis))
+    return jax.tree.map(lambda leaf: jax.device_put(jax.numpy.stack([leaf] * len(devices)), sharding), x)
+
+
+def _loss_and_episodes(compute_loss: Callable[..., Any]) -> Callable[..., Any]:
+    """The loss, whose metrics also hold, for each step of the data, how many episodes ended and the sums of their figures.
+
+    Brax averages them over an epoch, so their ratios are means over all episodes that ended in it.
+    """
+
+    def loss(params: Any, normalizer_params: Any, data: Any, rng: Any, **settings: Any) -> Any:
+        total, metrics = compute_loss(params, normalizer_params, data, rng, **settings)
+        extras = data.extras["state_extras"]
+        ended, figures = extras["episode_done"], extras["episode_metrics"]
+        per_episode = {
+            name: value / jax.numpy.maximum(figures["length"], 1) if name.endswith("_per_step") else value
+            for name, value in figures.items()
+        }
+        episodes = {f"episode/{name}": (ended * value).mean() for name, value in per_episode.items()}
+        return total, {**metrics, **episodes, "episodes": ended.mean()}
+
+    return loss
 
 
 def make_networks(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> networks.PPONetworks:
@@ -191,17 +221,19 @@ def call_seed(seed: int, index: int) -> int:
 
 
 def _figures(metrics: dict[str, Any], policy_period: float) -> dict[str, float]:
-    """What people want to see of brax's metrics: means over the latest episodes that ended."""
-    steps = float(metrics["episode/length"])
-    per_step = {k[8:-9]: float(v) for k, v in metrics.items() if k.startswith("episode/") and k.endswith("_per_step")}
+    """What people want to see of an epoch's metrics: means over the episodes that ended in it, nan where none did."""
+    found = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
+    ended = found["episodes"] or math.nan
+    episodes = {name.removeprefix("episode/"): v / ended for name, v in found.items() if name.startswith("episode/")}
+    steps = episodes["length"]
     learner = ("kl_mean", "policy_dist_mean_std", "policy_loss", "v_loss", "entropy_loss")
     return {
         "episode_seconds": steps * policy_period,
-        "falls": float(metrics["episode/fell"]),
-        "nonfinite": float(metrics["episode/nonfinite"]),
-        "reward_per_step": float(metrics["episode/sum_reward"]) / max(steps, 1.0),
-        **per_step,
-        **{name: float(metrics[f"episode/{name}"]) for name in learner},
+        "falls": episodes["fell"],
+        "nonfinite": episodes["nonfinite"],
+        "reward_per_step": episodes["sum_reward"] / steps,
+        **{name.removesuffix("_per_step"): v for name, v in episodes.items() if name.endswith("_per_step")},
+        **{name: found[name] for name in learner},
     }
 
 

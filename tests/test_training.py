@@ -1,6 +1,7 @@
 """Brax's parameters as named arrays and back, the exported policy against brax's own actor, the seeds of the calls."""
 
 import dataclasses
+import pathlib
 from typing import Any
 
 import brax.envs
@@ -11,6 +12,7 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
+from jax.experimental.compilation_cache import compilation_cache
 
 from bipedtrack import curriculum, policy, training
 from bipedtrack.checkpoint import CheckpointError
@@ -150,9 +152,54 @@ def test_brax_compiles_its_epoch_once_and_not_twice(caplog: pytest.LogCaptureFix
 
     once = compilations(1)
     assert once >= 1
-    with training.compiled_once():
+    with training.adapted_brax():
         assert compilations(3) == once
     assert compilations(3) == once + 1  # or brax no longer needs our help
+
+
+def test_an_epoch_reports_the_episodes_that_ended_in_it_and_can_be_kept_on_disk(tmp_path: pathlib.Path) -> None:
+    reported: list[dict[str, Any]] = []
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    compilation_cache.reset_cache()
+    try:
+        for name, value in zip(names, (str(tmp_path), 0.0), strict=True):
+            jax.config.update(name, value)
+        with training.adapted_brax():
+            ppo.train(
+                environment=brax.envs.get_environment("fast"),
+                num_timesteps=48,
+                num_evals=2,
+                run_evals=False,
+                episode_length=4,
+                num_envs=2,
+                unroll_length=6,
+                batch_size=2,
+                num_minibatches=1,
+                progress_fn=lambda steps, metrics: reported.append(metrics),
+            )
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+    (metrics,) = reported
+    # 48 steps of two robots, every fourth of which ends an episode
+    assert metrics["training/episodes"] == pytest.approx(1 / 4)
+    assert metrics["training/episode/length"] / metrics["training/episodes"] == pytest.approx(4)
+    assert list(tmp_path.glob("jit__fun-*"))
+
+
+def test_figures_are_means_over_the_episodes_that_ended() -> None:
+    # two of four steps ended an episode: one of 3 steps that fell, one of 5; brax gives means over all steps
+    sums = {"length": 3 + 5, "fell": 1 + 0, "nonfinite": 0, "sum_reward": 6 + 10, "ankle_error_cm_per_step": 2 + 4}
+    learner = dict.fromkeys(("kl_mean", "policy_dist_mean_std", "policy_loss", "v_loss", "entropy_loss"), 0.5)
+    metrics = {"episodes": 2 / 4, **{f"episode/{name}": value / 4 for name, value in sums.items()}, **learner}
+    found = training._figures({f"training/{name}": np.float32(value) for name, value in metrics.items()}, 0.02)
+    assert found["episode_seconds"] == pytest.approx(4 * 0.02)
+    assert (found["falls"], found["nonfinite"], found["ankle_error_cm"]) == pytest.approx((0.5, 0, 3))
+    assert found["reward_per_step"] == pytest.approx(2) and found["kl_mean"] == 0.5
+    nobody = training._figures({f"training/{name}": np.float32(0) for name in metrics}, 0.02)
+    assert np.isnan(nobody["falls"]) and nobody["kl_mean"] == 0
 
 
 def test_every_call_of_every_run_has_a_seed_of_its_own() -> None:
