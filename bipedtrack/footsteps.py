@@ -384,7 +384,7 @@ def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray,
 def problems_of(robot: Robot, boxes: Sequence[Box], step: TaskStep) -> list[str]:
     """What keeps the robot from making a task step, one sentence each; boxes count as lines from 1."""
     by_line = dict(enumerate(boxes, 1))
-    footholds = [_foothold_problems(robot, by_line, step.end, foot) for foot in np.flatnonzero(step.swing)]
+    footholds = [_foothold_problems(robot, by_line, step.end, foot) for foot in map(int, np.flatnonzero(step.swing))]
     return [*itertools.chain(*footholds), *_reach_problems(robot, step, True)]
 
 
