@@ -85,6 +85,7 @@ class Drive:
         self.script: Script | None = None
         self.loop = False
         self._line = 0  # of the script, the next one
+        self._built_boxes: tuple[Box, ...] | None = None  # that the model has
         self._placed: Foothold | None = None
         self._walking = self._trunk_asked = False
         self._build()
@@ -283,8 +284,11 @@ class Drive:
     # How it is done
 
     def _build(self) -> None:
-        """Model and data with the boxes, and the robot at the start."""
-        self.model, self.data = simulate.model_and_data(Script("", (), self.boxes, ()), self.robot.name)
+        """Model and data with the boxes, and the robot at the start at time 0."""
+        if self._built_boxes != self.boxes:
+            self.model, self.data = simulate.model_and_data(Script("", (), self.boxes, ()), self.robot.name)
+            self._built_boxes = self.boxes
+        self.data.time = 0.0
         self.taken: list[TaskStep] = []
         self.next_foot = 0
         self._stand(footsteps.initial_nodes(self.robot))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import pathlib
 from collections.abc import Sequence
 
@@ -50,7 +49,7 @@ def _line(robot: Robot, step: TaskStep) -> str:
         x, y, z = end.ankle_positions[foot]
         place = (x, y, z - robot.ankle_height, rotations.wrap(end.ankle_yaws[foot]), step.period, step.lift[foot])
         cells = [LEGS[foot], *map(_number, place)]
-    return ",".join([*cells, *map(_number, [*end.trunk_position, *_euler(end.trunk_orientation)])])
+    return ",".join([*cells, *map(_number, [*end.trunk_position, *rotations.to_euler(end.trunk_orientation)])])
 
 
 def _hold(seconds: float) -> str:
@@ -59,16 +58,6 @@ def _hold(seconds: float) -> str:
 
 def _same(start: Nodes, end: Nodes) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(start, end, strict=True))
-
-
-def _euler(orientation: np.ndarray) -> tuple[float, float, float]:
-    """Roll, pitch and yaw, rad, of Rz(yaw) Ry(pitch) Rx(roll)."""
-    turn = rotations.to_matrix(orientation)
-    return (
-        math.atan2(turn[2, 1], turn[2, 2]),
-        math.asin(min(max(-turn[2, 0], -1.0), 1.0)),
-        math.atan2(turn[1, 0], turn[0, 0]),
-    )
 
 
 def _number(value: float) -> str:

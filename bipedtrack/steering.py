@@ -348,3 +348,20 @@ def same_trunk(start: Nodes, end: Nodes) -> bool:
     apart = np.abs(end.trunk_position - start.trunk_position).max()
     turn = rotations.multiply(rotations.conjugate(start.trunk_orientation), end.trunk_orientation)
     return bool(apart < 1e-3 and np.abs(rotations.to_rotation_vector(turn)).max() < 1e-3)
+
+
+def trunk_at(robot: Robot, start: Nodes, position: np.ndarray, orientation: np.ndarray, asked: Steering) -> Steering:
+    """The wishes with the trunk at a place in the world: position (3,) m and quaternion (4,)."""
+    yaw = float(start.ankle_yaws.mean())
+    middle = start.ankle_positions.mean(axis=0) - np.array([0.0, 0.0, robot.ankle_height])
+    apart = np.asarray(position, float) - middle
+    ahead, aside = _turned(-yaw, apart[:2])
+    roll, pitch, turned = rotations.to_euler(np.asarray(orientation, float))
+    return asked._replace(
+        trunk_ahead=float(ahead),
+        trunk_aside=float(aside),
+        trunk_height=float(apart[2]),
+        trunk_roll=float(roll),
+        trunk_pitch=float(pitch),
+        trunk_yaw=float(rotations.wrap(turned - yaw)),
+    )

@@ -23,7 +23,7 @@ LADDER = """
     policy onnx_export env autoreset
     curriculum rollout progress recording suite
     training evaluation report
-    doctor train export evaluate simulate video drive page play __main__
+    doctor train export evaluate simulate video drive realtime scene page play __main__
 """.split()
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
