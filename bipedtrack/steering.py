@@ -203,7 +203,7 @@ def problems(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold,
 
 
 def nearest(possible: Callable[[np.ndarray], bool], wanted: np.ndarray, home: np.ndarray) -> np.ndarray | None:
-    """The possible point nearest to the wanted one, to about 3 mm, both (n,) m; None where not even home is possible.
+    """The possible point nearest to the wanted one, both (2,) m, to about 3 mm of distance; None where home is not possible.
 
     The way from home ends where the possible ones do; from there every direction that leads nearer is tried.
     """

@@ -82,13 +82,16 @@ class Tab:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
 
     def click(self, text: str) -> None:
-        """Clicks the button or tab with exactly this text."""
-        found = self.evaluate(
-            f"(() => {{ for (const e of document.querySelectorAll('button, [role=tab], label'))"
-            f" if (e.innerText.trim() === {json.dumps(text)} && e.getBoundingClientRect().width > 0)"
-            " { e.click(); return true; } return false; })()"
+        """Clicks with the mouse on the button, tab or checkbox with exactly this text, once it is there."""
+        script = (
+            "(() => { for (const e of document.querySelectorAll('button, [role=tab], label')) {"
+            f" if (e.innerText.trim() !== {json.dumps(text)} || !e.getClientRects().length) continue;"
+            " e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
+            " return [b.x + b.width / 2, b.y + b.height / 2]; } return null; })()"
         )
-        assert found, f"no button {text!r} in: {self.text}"
+        x, y = wait_until(lambda: self.evaluate(script))
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def picture(self) -> bytes:
         """A PNG of what is seen."""
