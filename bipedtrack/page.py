@@ -55,9 +55,9 @@ class Page:
           clock: the drive's.
           policies: those to choose from by name; the first one drives.
         """
-        self._server, self._clock, self._policies = server, clock, dict(policies)
+        self._server, self.clock, self._policies = server, clock, dict(policies)
         self._robot = clock.ask(lambda drive: drive.robot)
-        self._scene = Scene(server, self._robot)
+        self.scene = Scene(server, self._robot)
         self._stopped = threading.Event()
         server.initial_camera.position = (-1.3, -1.7, 1.2)
         server.initial_camera.look_at = (0.3, -0.2, 0.45)
@@ -74,17 +74,19 @@ class Page:
         self._add_keys()
         self._add_handles()
         # whoever leaves lets go
-        server.on_client_disconnect(lambda _: self._scene.held.clear())
+        server.on_client_disconnect(lambda _: self.scene.held.clear())
 
     def run(self) -> None:
-        """Draws until `stop`, 30 times a second, the plots and texts 5 times."""
+        """Draws until `stop`, 30 times a second, the plots and texts 5 times, while somebody looks on."""
         beat = 0
         while not self._stopped.wait(VIEW_SECONDS):
-            view = self._clock.view
+            if not self._server.get_clients():
+                continue
+            view = self.clock.view
             with self._server.atomic():
-                self._scene.show(view, self._follow.value)
+                self.scene.show(view, self._follow.value)
             if beat % 3 == 0:
-                self._scene.show_traces()
+                self.scene.show_traces()
             if beat % 6 == 0:
                 self._show_text(view)
                 self._show_plots()
@@ -99,7 +101,7 @@ class Page:
     def _ask(self, request: Callable[[Drive], Any]) -> Any:
         """What the drive answers, or None where it refuses; why stands on the page then."""
         try:
-            return self._clock.ask(request)
+            return self.clock.ask(request)
         except (ValueError, RuntimeError, OSError, TimeoutError) as error:
             self._say(str(error), wrong=True)
             return None
@@ -215,9 +217,9 @@ class Page:
             self._button("push", self._push)
         with gui.add_folder("time"):
             self._pause: Any = gui.add_checkbox("pause", False)
-            self._pause.on_update(lambda event: setattr(self._clock, "paused", bool(event.target.value)))
+            self._pause.on_update(lambda event: setattr(self.clock, "paused", bool(event.target.value)))
             speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0, hint="below 1: slow motion")
-            speed.on_update(lambda event: setattr(self._clock, "speed", float(event.target.value)))
+            speed.on_update(lambda event: setattr(self.clock, "speed", float(event.target.value)))
             self._button("single step, 5 ms", self._single_step)
             self._follow = gui.add_checkbox("the camera follows", True)
         with gui.add_folder("policy"):
@@ -240,11 +242,11 @@ class Page:
         self._ask(lambda drive: drive.push(impulse, direction))
 
     def _toggle_pause(self) -> None:
-        self._pause.value = self._clock.paused = not self._clock.paused
+        self._pause.value = self.clock.paused = not self.clock.paused
 
     def _single_step(self) -> None:
         self._pause.value = True
-        self._clock.single_step()
+        self.clock.single_step()
 
     def _use(self, name: str) -> None:
         """Another policy, loaded before the drive is asked to take it."""
@@ -271,24 +273,24 @@ class Page:
             command.on_trigger(lambda _, request=request: request())  # type: ignore[misc]
 
     def _add_handles(self) -> None:
-        self._scene.foot.on_update(lambda event: self._drag("foot", event.phase, self._place_foot, self._reaches_foot))
-        self._scene.trunk.on_update(lambda event: self._drag("trunk", event.phase, self._place_trunk, self._reaches_trunk))
+        self.scene.foot.on_update(lambda event: self._drag("foot", event.phase, self._place_foot, self._reaches_foot))
+        self.scene.trunk.on_update(lambda event: self._drag("trunk", event.phase, self._place_trunk, self._reaches_trunk))
 
     def _drag(self, handle: str, phase: str, place: Callable[[], None], reaches: Callable[[], bool]) -> None:
         """The robot waits while somebody holds a handle, and follows when it is let go."""
         if phase == "start":
-            self._scene.held.add(handle)
+            self.scene.held.add(handle)
             self._ask(Drive.lead)
         elif phase == "end":
             try:
                 place()
             finally:
-                self._scene.held.discard(handle)
-        elif handle in self._scene.held:
-            self._scene.mark(handle, reaches())
+                self.scene.held.discard(handle)
+        elif handle in self.scene.held:
+            self.scene.mark(handle, reaches())
 
     def _wanted_foothold(self) -> steering.Foothold:
-        return self._scene.foothold(self._clock.view.next_foot.foot)
+        return self.scene.foothold(self.clock.view.next_foot.foot)
 
     def _reaches_foot(self) -> bool:
         wanted = self._wanted_foothold()
@@ -309,7 +311,7 @@ class Page:
 
     def _wanted_trunk(self) -> Steering:
         end, now = self._ask(lambda drive: (drive.step.end, drive.steering))
-        return steering.trunk_at(self._robot, end, self._scene.trunk.position, self._scene.trunk.wxyz, now)
+        return steering.trunk_at(self._robot, end, self.scene.trunk.position, self.scene.trunk.wxyz, now)
 
     def _reaches_trunk(self) -> bool:
         wanted = self._wanted_trunk()
@@ -326,8 +328,8 @@ class Page:
     # What is shown
 
     def _show_text(self, view: View) -> None:
-        pace = self._clock.pace
-        factor = "paused" if self._clock.paused else f"{pace.factor:.2f} x real time"
+        pace = self.clock.pace
+        factor = "paused" if self.clock.paused else f"{pace.factor:.2f} x real time"
         self._status.content = (
             f"**{view.mode.value}** at {view.time:.1f} s, {factor}; "
             f"a control step takes {pace.step_ms:.1f} ms, 99 %: {pace.step_p99_ms:.1f} ms"
@@ -341,7 +343,7 @@ class Page:
                 slider.value = value
 
     def _show_plots(self) -> None:
-        history: list[Sample] = list(self._clock.history)[::2]
+        history: list[Sample] = list(self.clock.history)[::2]
         times = np.array([sample.time for sample in history])
         if len(times) < 2 or (np.diff(times) < 0).any():  # after a reset, only what came after it
             first = int(np.flatnonzero(np.diff(times) < 0)[-1]) + 1 if len(times) > 1 else 0

@@ -23,9 +23,7 @@ from bipedtrack import paths
 from bipedtrack.messages import fail
 
 if TYPE_CHECKING:
-    import viser
-
-    from bipedtrack.realtime import RealTime
+    from bipedtrack.page import Page
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 # One core is enough for the controller; a BLAS with more threads makes its small products wait for one another.
@@ -75,7 +73,7 @@ def require_free(host: str, port: int) -> None:
 
 
 @contextlib.contextmanager
-def serve(options: Play) -> Iterator[tuple[viser.ViserServer, RealTime]]:
+def serve(options: Play) -> Iterator[Page]:
     """A page with a robot that is ready to be driven, until the context ends. Raises ValueError, RuntimeError, OSError."""
     import viser
 
@@ -94,7 +92,7 @@ def serve(options: Play) -> Iterator[tuple[viser.ViserServer, RealTime]]:
         page = Page(server, clock, policies)
         drawing = threading.Thread(target=page.run, name="drawing", daemon=True)
         drawing.start()
-        yield server, clock
+        yield page
         page.stop()
         drawing.join(timeout=5)
     finally:

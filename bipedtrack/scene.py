@@ -52,7 +52,9 @@ class Scene:
         ]
         self._traces = {color: deque[np.ndarray](maxlen=_TAIL) for color in (TARGET_COLOR, MEASURED_COLOR)}
         self._lines = {
-            color: self._scene.add_line_segments(f"/world/trace/{i}", np.zeros((0, 2, 3), np.float32), color, thickness=0.012)
+            color: self._scene.add_line_segments(
+                f"/world/trace/{i}", np.zeros((0, 2, 3), np.float32), color, thickness=0.012
+            )
             for i, color in enumerate(self._traces)
         }
         self._prints = [

@@ -20,6 +20,7 @@ from bipedtrack.robot import LEGS, Robot
 FOOT_DISTANCE = 0.2  # m between the ankles of feet side by side
 HOLD_SECONDS = 0.1  # of a task step that holds: soon enough for the next wish
 TRUNK_SECONDS = 1.0  # of a task step that moves the trunk alone
+_BACKWARD = 0.15  # m, the longest step backward in training
 _RISE = 0.2  # m, the highest step up or down that is tried
 _REACH = 0.36  # m, the longest step onto a tread
 _HALF_TREAD = 0.15  # m from an edge to a foothold on ground that is longer than a tread
@@ -117,7 +118,7 @@ def walk(robot: Robot, boxes: Sequence[Box], start: Nodes, foot: int, asked: Ste
     leads = asked.aside * (0.5 - foot) > 0
     advance = np.array(
         [
-            asked.ahead * asked.step_length,
+            max(asked.ahead * asked.step_length, -_BACKWARD),
             2 * asked.aside * asked.sidle_length if leads else 0.0,
             asked.turn * asked.turn_angle,
         ]

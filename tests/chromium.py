@@ -17,7 +17,7 @@ PROGRAM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-sync"),
     *("--disable-component-update", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--mute-audio"),
-    *("--remote-debugging-port=0", "--window-size=900,600"),
+    *("--remote-debugging-port=0", "--window-size=640,420"),
 )
 
 

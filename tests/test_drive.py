@@ -146,9 +146,7 @@ def test_a_foothold_out_of_reach_is_moved_and_said_so(robot: robots.Robot) -> No
 
 def test_a_trunk_handle_gives_the_wishes_that_put_the_trunk_there(robot: robots.Robot) -> None:
     start = steering.walk(robot, (), footsteps.initial_nodes(robot), 0, Steering(ahead=1, turn=1)).step.end
-    asked = Steering(
-        trunk_ahead=0.03, trunk_aside=-0.02, trunk_height=0.7, trunk_roll=0.05, trunk_pitch=-0.1, trunk_yaw=0.2
-    )
+    asked = Steering(trunk_ahead=0.03, trunk_aside=-0.02, trunk_height=0.7, trunk_roll=0.05, trunk_pitch=-0.1, trunk_yaw=0.2)
     end = steering.trunk_step(robot, start, asked).end
     found = steering.trunk_at(robot, start, end.trunk_position, end.trunk_orientation, Steering())
     assert np.allclose(found, asked)
