@@ -92,9 +92,11 @@ def serve(options: Play) -> Iterator[Page]:
         page = Page(server, clock, policies)
         drawing = threading.Thread(target=page.run, name="drawing", daemon=True)
         drawing.start()
-        yield page
-        page.stop()
-        drawing.join(timeout=5)
+        try:
+            yield page
+        finally:
+            page.stop()
+            drawing.join(timeout=5)
     finally:
         clock.stop()
         server.stop()
@@ -110,10 +112,9 @@ def main() -> None:
     if options.host not in LOOPBACK:
         print(f"bipedtrack: --host {options.host}: whoever reaches this machine can drive the robot", file=sys.stderr)
     try:
-        with serve(options):
+        with contextlib.suppress(KeyboardInterrupt), serve(options):
             print(f"drive the robot at http://{options.host}:{options.port} (Ctrl-C ends)", flush=True)
-            with contextlib.suppress(KeyboardInterrupt):
-                threading.Event().wait()
+            threading.Event().wait()
     except (ValueError, RuntimeError, OSError) as error:
         fail(str(error))
 

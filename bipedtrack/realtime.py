@@ -38,8 +38,9 @@ class Pace(NamedTuple):
     """How well the clock is kept."""
 
     factor: float  # simulated seconds per second, over the last one
-    step_ms: float  # median duration of a control step
-    step_p99_ms: float  # its 99th percentile over the last 10 s
+    step_ms: float  # median duration of a control step over the last 10 s
+    step_p99_ms: float  # its 99th percentile
+    work_p99_ms: float  # the same of the processor's time alone: what other programs take is not in it
     late_p99_ms: float  # 99th percentile of how late control steps began
 
 
@@ -56,6 +57,7 @@ class RealTime:
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
         steps = round(HISTORY_SECONDS / drive.timestep)
         self._durations: deque[float] = deque(maxlen=steps)
+        self._works: deque[float] = deque(maxlen=steps)
         self._delays: deque[float] = deque(maxlen=steps)
         self._marks: deque[tuple[float, float]] = deque(maxlen=round(1 / VIEW_SECONDS))  # clock s, simulated s
         self.history: deque[Sample] = deque(maxlen=round(HISTORY_SECONDS / VIEW_SECONDS))
@@ -90,8 +92,8 @@ class RealTime:
         marks, durations, delays = list(self._marks), list(self._durations), list(self._delays)
         elapsed = marks[-1][0] - marks[0][0] if len(marks) > 1 else 0.0
         factor = (marks[-1][1] - marks[0][1]) / elapsed if elapsed > 0 and not self.paused else 0.0
-        ms = 1e3 * np.percentile(durations or [0.0], [50, 99])
-        return Pace(factor, float(ms[0]), float(ms[1]), float(1e3 * np.percentile(delays or [0.0], 99)))
+        ms = [1e3 * float(np.percentile(durations or [0.0], share)) for share in (50, 99)]
+        return Pace(factor, *ms, *(1e3 * float(np.percentile(taken or [0.0], 99)) for taken in (list(self._works), delays)))
 
     def _run(self) -> None:
         due = next_view = time.perf_counter()
@@ -104,7 +106,9 @@ class RealTime:
                 time.sleep(0.005)
             else:
                 self._delays.append(max(0.0, now - due))
+                work = time.thread_time()
                 self._drive.advance()
+                self._works.append(time.thread_time() - work)
                 done = time.perf_counter()
                 self._durations.append(done - now)
                 due += self._drive.timestep / self.speed

@@ -21,7 +21,7 @@ FLAGS = (
 )
 
 
-def wait_until(holds: Callable[[], Any], seconds: float = 20.0) -> Any:
+def wait_until(holds: Callable[[], Any], seconds: float = 60.0) -> Any:
     """What `holds` returns once that is true; an assertion fails after so many seconds."""
     end = time.monotonic() + seconds
     while not (found := holds()):
