@@ -89,7 +89,14 @@ class Tab:
             " e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
             " return [b.x + b.width / 2, b.y + b.height / 2]; } return null; })()"
         )
-        x, y = wait_until(lambda: self.evaluate(script))
+
+        def at_rest() -> Any:
+            """Where it is, once the page has come to rest around it."""
+            before = self.evaluate(script)
+            time.sleep(0.2)
+            return before if before == self.evaluate(script) else None
+
+        x, y = wait_until(at_rest)
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 

@@ -245,7 +245,7 @@ def test_a_button_makes_it_walk(tab: Tab, page: Page) -> None:
 @browser_tests
 def test_a_push_moves_it(tab: Tab, page: Page) -> None:
     tab.click("Watch")
-    time.sleep(0.5)
+    wait_until(lambda: "impulse" in tab.text)
     at = page.clock.view.qpos[1]
     tab.click("push")
     wait_until(lambda: page.clock.view.qpos[1] > at + 0.01)
