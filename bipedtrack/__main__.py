@@ -9,6 +9,7 @@ COMMANDS = {
     "export": "write the policy of a training run to one file that numpy alone can run",
     "simulate": "drive the robot through a footstep script in MuJoCo C",
     "evaluate": "measure the tracking error of every step, on two simulators",
+    "play": "drive the robot in a browser",
     "video": "film a policy on a footstep script",
     "doctor": "check versions, devices, rendering and the physics of this machine",
 }

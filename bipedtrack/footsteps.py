@@ -34,7 +34,7 @@ import itertools
 import math
 import reprlib
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -158,7 +158,7 @@ def parse(text: str, robot: Robot, name: str) -> Script:
     rows = _read_rows(lines, robot.timestep, problems)
     steps, within_reach = [], True
     for row in rows:
-        step = _task_step(robot, boxes.values(), now, row)
+        step = task_step(robot, boxes.values(), now, row.feet, row.values)
         if boxes_known and _known(step.end):
             for foot in row.feet:
                 problems[row.line] += _foothold_problems(robot, boxes, step.end, foot)
@@ -335,18 +335,28 @@ def _number(text: str, what: str, unit: str, problems: list[str]) -> float:
     return value
 
 
-def _task_step(robot: Robot, boxes: Iterable[Box], start: Nodes, row: _Row) -> TaskStep:
-    """The task step of a line, from where the last one ended, with every default filled in."""
-    given = row.values.get
+def task_step(
+    robot: Robot, boxes: Iterable[Box], start: Nodes, feet: Sequence[int], values: Mapping[str, float]
+) -> TaskStep:
+    """The task step of a line, from where the last one ended, with every default filled in.
+
+    Args:
+      robot: its constants.
+      boxes: what stands on the ground.
+      start: where the last task step ended.
+      feet: indices of the feet that step, none where the trunk moves alone.
+      values: the line's cells by the names of UNITS, without the empty ones.
+    """
+    given = values.get
     ankles, yaws = start.ankle_positions.copy(), start.ankle_yaws.copy()
-    for foot in row.feet:
+    for foot in feet:
         x, y = given("x", ankles[foot, 0]), given("y", ankles[foot, 1])
-        ankles[foot] = x, y, given("z", _ground(boxes, x, y)) + robot.ankle_height
+        ankles[foot] = x, y, given("z", ground(boxes, x, y)) + robot.ankle_height
         yaws[foot] += rotations.wrap(given("yaw", yaws[foot]) - yaws[foot])
 
-    holds = not row.feet and not any(column.startswith("trunk") for column in row.values)
-    end = start if holds else _over_feet(robot, start, ankles, yaws, row.values)
-    swing = np.array([float(foot in row.feet) for foot in range(len(LEGS))])
+    holds = not feet and not any(column.startswith("trunk") for column in values)
+    end = start if holds else _over_feet(robot, start, ankles, yaws, values)
+    swing = np.array([float(foot in feet) for foot in range(len(LEGS))])
     lift = swing * given("lift", LIFT)
     return TaskStep(
         start=start,
@@ -359,7 +369,7 @@ def _task_step(robot: Robot, boxes: Iterable[Box], start: Nodes, row: _Row) -> T
     )
 
 
-def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: dict[str, float]) -> Nodes:
+def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: Mapping[str, float]) -> Nodes:
     """Nodes with the trunk where `values` say, or else with the centre of mass over the feet's middle."""
     given = values.get
     x, y, z = ankles.mean(axis=0)
@@ -379,6 +389,13 @@ def _balanced(robot: Robot, nodes: Nodes) -> Nodes:
     return nodes
 
 
+def problems_of(robot: Robot, boxes: Sequence[Box], step: TaskStep) -> list[str]:
+    """What keeps the robot from making a task step, one sentence each; boxes count as lines from 1."""
+    by_line = dict(enumerate(boxes, 1))
+    footholds = [_foothold_problems(robot, by_line, step.end, foot) for foot in map(int, np.flatnonzero(step.swing))]
+    return [*itertools.chain(*footholds), *_reach_problems(robot, step, True)]
+
+
 def _known(nodes: Nodes) -> bool:
     """Whether no part of the nodes is nan."""
     return all(bool(np.isfinite(part).all()) for part in nodes)
@@ -396,7 +413,7 @@ def _foothold_problems(robot: Robot, boxes: dict[int, Box], nodes: Nodes, foot: 
         problems.append(f"{subject} overlaps {other} by {_cm(depth)}; wanted the soles of {size} apart")
     z = nodes.ankle_positions[foot, 2] - robot.ankle_height
     inside = _boxes_around(robot, boxes, nodes, foot)
-    gaps = [z - _ground(boxes.values(), x, y, z + _TOLERANCE) for x, y in soles[foot]]
+    gaps = [z - ground(boxes.values(), x, y, z + _TOLERANCE) for x, y in soles[foot]]
     if inside:
         for line in inside:
             right = f"wanted it on top, z = {boxes[line].top:g} m, or beside it"
@@ -453,7 +470,7 @@ def _deg(angle: float) -> str:
     return f"{math.degrees(angle):.1f} deg"
 
 
-def _ground(boxes: Iterable[Box], x: float, y: float, below: float = math.inf) -> float:
+def ground(boxes: Iterable[Box], x: float, y: float, below: float = math.inf) -> float:
     """The height of the ground at (x, y), m: the highest top that is not above `below`, or the floor."""
     return max([0.0] + [box.top for box in boxes if box.top <= below and _covers(box, x, y)])
 

@@ -98,6 +98,14 @@ def from_euler(roll: Array, pitch: Array, yaw: Array) -> Array:
     )
 
 
+def to_euler(q: Array) -> tuple[Array, Array, Array]:
+    """Roll, pitch and yaw, rad, of a quaternion (4,): the inverse of `from_euler` for pitches within ±π/2."""
+    xp = namespace(q)
+    turn = to_matrix(q)
+    pitch = -xp.asin(xp.clip(turn[2, 0], -1.0, 1.0))
+    return xp.atan2(turn[2, 1], turn[2, 2]), pitch, xp.atan2(turn[1, 0], turn[0, 0])
+
+
 def wrap(angle: Array) -> Array:
     """The same angles in (-π, π], any shape."""
     xp = namespace(angle)

@@ -20,11 +20,11 @@ LADDER = """
     rotations robot
     nodes kinematics trace
     planner terrain
-    tasks footsteps plans disturbances control observation rewards metrics verdicts charts
+    tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
     policy onnx_export env autoreset
     curriculum rollout progress recording suite
     training evaluation report
-    doctor train export evaluate simulate video __main__
+    doctor train export evaluate simulate video drive realtime scene page play __main__
 """.split()
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.

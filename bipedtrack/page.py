@@ -1,0 +1,353 @@
+"""The page on which a drive is steered and watched: panels, keys and handles of a viser server."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import viser
+import viser.uplot
+
+from bipedtrack import footsteps, policy, scripts, steering
+from bipedtrack.drive import Drive, Mode, View
+from bipedtrack.realtime import VIEW_SECONDS, RealTime, Sample
+from bipedtrack.scene import Scene
+from bipedtrack.steering import LIMITS, Steering
+
+_SLIDERS = {
+    "step_length": ("step length, m", 0.01),
+    "sidle_length": ("sidle length, m", 0.01),
+    "turn_angle": ("turn per step, rad", 0.01),
+    "period": ("period, s", 0.05),
+    "lift": ("lift, m", 0.01),
+    "trunk_height": ("trunk height, m", 0.01),
+    "trunk_roll": ("trunk roll, rad", 0.01),
+    "trunk_pitch": ("trunk pitch, rad", 0.01),
+    "trunk_yaw": ("trunk yaw, rad", 0.01),
+    "trunk_ahead": ("trunk ahead, m", 0.005),
+    "trunk_aside": ("trunk aside, m", 0.005),
+}
+_PLOTS = (
+    ("ankle error", ("cm", "deg"), ("ankle_cm", "ankle_deg")),
+    ("trunk error", ("cm", "deg"), ("trunk_cm", "trunk_deg")),
+    ("feedback, root mean square of 12 in [-1, 1]", ("a_fb",), ("feedback",)),
+)
+_COLORS = ("#2972d9", "#f2731a")
+_KEYS = """
+**Keys** (click into the picture first): **I** forward, **K** backward, **J** turn left, **L** turn right, **U** sidle left,
+**O** sidle right, **space** stop and hold, **B** push, **P** pause, **N** single step, **G** stand up, **R** reset.
+W A S D, the arrows and the mouse move the camera.
+"""
+
+
+class Page:
+    """One page for any number of viewers; what one of them changes all see."""
+
+    def __init__(self, server: viser.ViserServer, clock: RealTime, policies: Mapping[str, pathlib.Path]):
+        """Fills the server's page.
+
+        Args:
+          server: of viser, already listening.
+          clock: the drive's.
+          policies: those to choose from by name; the first one drives.
+        """
+        self._server, self.clock, self._policies = server, clock, dict(policies)
+        self._robot = clock.ask(lambda drive: drive.robot)
+        self.scene = Scene(server, self._robot)
+        self._stopped = threading.Event()
+        server.initial_camera.position = (-1.3, -1.7, 1.2)
+        server.initial_camera.look_at = (0.3, -0.2, 0.45)
+        server.gui.set_panel_label("bipedtrack")
+        self._status = server.gui.add_markdown("")
+        self._note = server.gui.add_markdown("")
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Drive"):
+            self._sliders = self._add_steering()
+        with tabs.add_tab("Scripts"):
+            self._add_scripts()
+        with tabs.add_tab("Watch"):
+            self._add_watching()
+        self._add_keys()
+        self._add_handles()
+        # whoever leaves lets go
+        server.on_client_disconnect(lambda _: self.scene.held.clear())
+
+    def run(self) -> None:
+        """Draws until `stop`, 30 times a second, the plots and texts 5 times, while somebody looks on."""
+        beat = 0
+        while not self._stopped.wait(VIEW_SECONDS):
+            if not self._server.get_clients():
+                continue
+            view = self.clock.view
+            with self._server.atomic():
+                self.scene.show(view, self._follow.value)
+            if beat % 3 == 0:
+                self.scene.show_traces()
+            if beat % 6 == 0:
+                self._show_text(view)
+                self._show_plots()
+            beat += 1
+
+    def stop(self) -> None:
+        """Ends `run`."""
+        self._stopped.set()
+
+    # Asking the drive
+
+    def _ask(self, request: Callable[[Drive], Any]) -> Any:
+        """What the drive answers, or None where it refuses; why stands on the page then."""
+        try:
+            return self.clock.ask(request)
+        except (ValueError, RuntimeError, OSError, TimeoutError) as error:
+            self._say(str(error), wrong=True)
+            return None
+
+    def _say(self, words: str, wrong: bool = False) -> None:
+        """A sentence in every viewer's corner."""
+        for client in self._server.get_clients().values():
+            client.add_notification(
+                "not done" if wrong else "done", words, color="red" if wrong else None, auto_close_seconds=10
+            )
+
+    def _steer(self, **wishes: float) -> None:
+        self._ask(lambda drive: drive.steer(**wishes))
+
+    def _button(self, label: str, request: Callable[[], Any], hint: str | None = None) -> None:
+        self._server.gui.add_button(label, hint=hint).on_click(lambda _: request())
+
+    # Panels
+
+    def _moves(self) -> dict[str, tuple[str, Callable[[], Any]]]:
+        """Name, key and request of all that moves the feet."""
+        still = {"ahead": 0.0, "aside": 0.0, "turn": 0.0}
+
+        def go(**way: float) -> Callable[[], None]:
+            return lambda: self._steer(**(still | way))
+
+        return {
+            "forward": ("I", go(ahead=1.0)),
+            "backward": ("K", go(ahead=-1.0)),
+            "turn left": ("J", go(turn=1.0)),
+            "turn right": ("L", go(turn=-1.0)),
+            "sidle left": ("U", go(aside=1.0)),
+            "sidle right": ("O", go(aside=-1.0)),
+            "stop and hold": ("space", lambda: self._ask(Drive.stop)),
+        }
+
+    def _add_steering(self) -> dict[str, Any]:
+        """Buttons and sliders that steer, and what happens after a fall."""
+        gui, moves = self._server.gui, self._moves()
+        for names in (("forward", "backward"), ("turn left", "turn right"), ("sidle left", "sidle right")):
+            group = gui.add_button_group("", names)
+            group.on_click(lambda event: moves[str(event.target.value)][1]())
+        self._button("stop and hold", moves["stop and hold"][1])
+        self._button("stand up at the last foothold", lambda: self._ask(Drive.stand_up), "after a fall")
+        self._button("reset", lambda: self._ask(Drive.reset), "back to the start")
+        ground = gui.add_dropdown("ground", ("level", "stairs", "obstacles"))
+        ground.on_update(lambda event: self._lay_out(str(event.target.value)))
+        gui.add_markdown(_KEYS)
+        sliders: dict[str, Any] = {}
+        with gui.add_folder("the next task step"):
+            for name, (label, grain) in _SLIDERS.items():
+                low, high = LIMITS[name]
+                sliders[name] = gui.add_slider(label, low, high, grain, getattr(Steering(), name))
+                sliders[name].on_update(functools.partial(self._slid, name))
+        return sliders
+
+    def _slid(self, name: str, event: Any) -> None:
+        if event.client is not None:  # somebody's hand, not `_show_text`
+            self._steer(**{name: float(event.target.value)})
+
+    def _lay_out(self, name: str) -> None:
+        """Another ground: the boxes of a ready script, and the robot at the start."""
+        boxes = () if name == "level" else footsteps.load(scripts.ready()[name], self._robot).boxes
+        self._ask(lambda drive: drive.reset(boxes))
+
+    def _add_scripts(self) -> None:
+        """Load, edit, run, loop, save; a drive as a script."""
+        gui, ready = self._server.gui, scripts.ready()
+        chosen = gui.add_dropdown("ready", tuple(ready), initial_value="walk")
+        self._text: Any = gui.add_text("script", ready["walk"].read_text(encoding="utf-8"), multiline=True)
+        self._loop = gui.add_checkbox("loop", False)
+        self._button("run", self._run_script)
+        self._button("stop and hold ", lambda: self._ask(Drive.stop))
+        gui.add_button("save").on_click(lambda event: self._save(event, self._text.value, "script.csv"))
+        gui.add_button("the drive so far as a script").on_click(lambda _: self._write_down())
+        upload = gui.add_upload_button("load a file", mime_type=".csv,text/csv,text/plain")
+        self._problems = gui.add_markdown("")
+
+        @chosen.on_update
+        def _(event: Any) -> None:
+            self._text.value = ready[event.target.value].read_text(encoding="utf-8")
+
+        @upload.on_upload
+        def _(event: Any) -> None:
+            self._text.value = event.target.value.content.decode("utf-8", errors="replace")
+
+    def _run_script(self) -> None:
+        self._problems.content = ""
+        try:
+            script = footsteps.parse(self._text.value, self._robot, "script")
+        except footsteps.ScriptError as error:
+            self._problems.content = "\n".join(f"- {line}" for line in str(error).splitlines())
+            return
+        self._ask(lambda drive: drive.run(script, self._loop.value))
+
+    def _write_down(self) -> None:
+        """The drive's text into the editor."""
+        written = self._ask(Drive.as_script)
+        if written is not None:
+            self._text.value = written
+
+    def _save(self, event: Any, text: str, name: str) -> None:
+        if event.client is not None:
+            event.client.send_file_download(name, text.encode(), save_immediately=True)
+
+    def _add_watching(self) -> None:
+        """Plots, push, time, policy."""
+        gui = self._server.gui
+        self._plots = [self._add_plot(*plot) for plot in _PLOTS]
+        with gui.add_folder("push"):
+            self._impulse = gui.add_slider("impulse, N s", 0.0, 100.0, 1.0, 10.0)
+            self._direction = gui.add_slider("direction, deg (0 forward, 90 left)", -180.0, 180.0, 15.0, 90.0)
+            self._button("push", self._push)
+        with gui.add_folder("time"):
+            self._pause: Any = gui.add_checkbox("pause", False)
+            self._pause.on_update(lambda event: setattr(self.clock, "paused", bool(event.target.value)))
+            speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0, hint="below 1: slow motion")
+            speed.on_update(lambda event: setattr(self.clock, "speed", float(event.target.value)))
+            self._button("single step, 5 ms", self._single_step)
+            self._follow = gui.add_checkbox("the camera follows", True)
+        with gui.add_folder("policy"):
+            chosen = gui.add_dropdown("policy", tuple(self._policies))
+            chosen.on_update(lambda event: self._use(str(event.target.value)))
+            feedback = gui.add_checkbox("feedback (off: inverse kinematics alone)", True)
+            feedback.on_update(lambda event: self._ask(lambda drive: setattr(drive, "feedback", bool(event.target.value))))
+
+    def _add_plot(self, title: str, labels: tuple[str, ...], names: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
+        series = [viser.uplot.Series(label="s")]
+        series += [
+            viser.uplot.Series(label=label, stroke=color, width=1.5) for label, color in zip(labels, _COLORS, strict=False)
+        ]
+        empty = (np.zeros(1), *(np.zeros(1) for _ in names))
+        scales = {"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(auto=True)}
+        return self._server.gui.add_uplot(empty, tuple(series), title=title, scales=scales, height=150), names
+
+    def _push(self) -> None:
+        impulse, direction = float(self._impulse.value), float(self._direction.value)
+        self._ask(lambda drive: drive.push(impulse, direction))
+
+    def _toggle_pause(self) -> None:
+        self._pause.value = self.clock.paused = not self.clock.paused
+
+    def _single_step(self) -> None:
+        self._pause.value = True
+        self.clock.single_step()
+
+    def _use(self, name: str) -> None:
+        """Another policy, loaded before the drive is asked to take it."""
+        try:
+            loaded = policy.load(self._policies[name], self._robot)
+        except (ValueError, RuntimeError, OSError) as error:
+            self._say(str(error), wrong=True)
+            return
+        self._ask(lambda drive: drive.use(policy.Controller(loaded, drive.feedback)))
+
+    # Keys and handles
+
+    def _add_keys(self) -> None:
+        keys = dict(self._moves())
+        keys |= {
+            "push": ("B", self._push),
+            "pause": ("P", self._toggle_pause),
+            "single step": ("N", self._single_step),
+            "stand up": ("G", lambda: self._ask(Drive.stand_up)),
+            "reset": ("R", lambda: self._ask(Drive.reset)),
+        }
+        for label, (key, request) in keys.items():
+            command = self._server.gui.add_command(label, hotkey=key)  # type: ignore[arg-type]
+            command.on_trigger(lambda _, request=request: request())  # type: ignore[misc]
+
+    def _add_handles(self) -> None:
+        self.scene.foot.on_update(lambda event: self._drag("foot", event.phase, self._place_foot, self._reaches_foot))
+        self.scene.trunk.on_update(lambda event: self._drag("trunk", event.phase, self._place_trunk, self._reaches_trunk))
+
+    def _drag(self, handle: str, phase: str, place: Callable[[], None], reaches: Callable[[], bool]) -> None:
+        """The robot waits while somebody holds a handle, and follows when it is let go."""
+        if phase == "start":
+            self.scene.held.add(handle)
+            self._ask(Drive.lead)
+        elif phase == "end":
+            try:
+                place()
+            finally:
+                self.scene.held.discard(handle)
+        elif handle in self.scene.held:
+            self.scene.mark(handle, reaches())
+
+    def _wanted_foothold(self) -> steering.Foothold:
+        return self.scene.foothold(self.clock.view.next_foot.foot)
+
+    def _reaches_foot(self) -> bool:
+        wanted = self._wanted_foothold()
+        return not self._ask(lambda drive: drive.reaches(wanted))
+
+    def _place_foot(self) -> None:
+        wanted = self._wanted_foothold()
+        boxes, end, asked = self._ask(lambda drive: (drive.boxes, drive.step.end, drive.steering))
+        # the search for the nearest foothold takes long; the robot does not wait for it
+        planned = steering.place(self._robot, boxes, end, wanted, asked)
+        if planned.step.swing.any():
+            end = planned.step.end
+            x, y, _ = end.ankle_positions[wanted.foot]
+            found = steering.Foothold(wanted.foot, float(x), float(y), float(end.ankle_yaws[wanted.foot]))
+            self._ask(lambda drive: drive.place(found))
+        if planned.note:
+            self._say(planned.note, wrong=not planned.step.swing.any())
+
+    def _wanted_trunk(self) -> Steering:
+        end, now = self._ask(lambda drive: (drive.step.end, drive.steering))
+        return steering.trunk_at(self._robot, end, self.scene.trunk.position, self.scene.trunk.wxyz, now)
+
+    def _reaches_trunk(self) -> bool:
+        wanted = self._wanted_trunk()
+        return steering.clamped(wanted) == wanted
+
+    def _place_trunk(self) -> None:
+        wanted = self._wanted_trunk()
+        boxes, end = self._ask(lambda drive: (drive.boxes, drive.step.end))
+        within, note = steering.lean(self._robot, boxes, end, wanted)
+        self._steer(**{name: value for name, value in within._asdict().items() if name.startswith("trunk")})
+        if note:
+            self._say(note)
+
+    # What is shown
+
+    def _show_text(self, view: View) -> None:
+        pace = self.clock.pace
+        factor = "paused" if self.clock.paused else f"{pace.factor:.2f} x real time"
+        self._status.content = (
+            f"**{view.mode.value}** at {view.time:.1f} s, {factor}; "
+            f"a control step takes {pace.step_ms:.1f} ms, 99 %: {pace.step_p99_ms:.1f} ms"
+        )
+        note = f"**{view.note}**" if view.mode is Mode.FALLEN else view.note
+        if self._note.content != note:
+            self._note.content = note
+        for name, slider in self._sliders.items():
+            value = getattr(view.steering, name)
+            if abs(slider.value - value) > 1e-6:
+                slider.value = value
+
+    def _show_plots(self) -> None:
+        history: list[Sample] = list(self.clock.history)[::2]
+        times = np.array([sample.time for sample in history])
+        if len(times) < 2 or (np.diff(times) < 0).any():  # after a reset, only what came after it
+            first = int(np.flatnonzero(np.diff(times) < 0)[-1]) + 1 if len(times) > 1 else 0
+            history, times = history[first:], times[first:]
+        for plot, names in self._plots:
+            if len(times):
+                plot.data = (times, *(np.array([getattr(sample, name) for sample in history]) for name in names))

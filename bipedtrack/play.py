@@ -1,0 +1,123 @@
+"""Drives the robot in a browser, in MuJoCo C at real time: a page on 127.0.0.1 that needs no other address.
+
+python -m bipedtrack.play
+python -m bipedtrack.play runs/quick-0 --port 8081
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.util
+import os
+import pathlib
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from bipedtrack import paths
+from bipedtrack.messages import fail
+
+if TYPE_CHECKING:
+    from bipedtrack.page import Page
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+# One core is enough for the controller; a BLAS with more threads makes its small products wait for one another.
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclasses.dataclass(frozen=True)
+class Play:
+    """Serves a page on which the robot is driven; Ctrl-C ends it."""
+
+    policy: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
+    """A policy file or a run directory. Default: the policy that ships."""
+    host: str = "127.0.0.1"
+    """The address to listen at. Any other than this one lets other machines in."""
+    port: int = 8080
+    """The port to listen at."""
+
+
+def shipped() -> dict[str, pathlib.Path]:
+    """The policies that come with the package, by name, `first` first."""
+    found = {path.stem: path for path in sorted((paths.data_dir("models") / "policies").glob("*.npz"))}
+    return {name: found[name] for name in sorted(found, key=lambda name: (name != "first", name))}
+
+
+def choice(given: pathlib.Path | None) -> dict[str, pathlib.Path]:
+    """The policies to choose from, by name; the given one comes first. Raises ValueError where there is none."""
+    ready = shipped()
+    if given is not None:
+        name = given.stem if given.suffix == ".npz" else given.name
+        ready = {name if name not in ready else str(given): given, **ready}
+    if not ready:
+        raise ValueError("no policy comes with this installation; wanted the path of one")
+    return ready
+
+
+def require_free(host: str, port: int) -> None:
+    """Raises ValueError where nobody can listen: the address is unknown or the port taken."""
+    if not 1 <= port <= 65535:
+        raise ValueError(f"--port {port}: must be from 1 to 65535")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(address)
+    except OSError as error:
+        raise ValueError(f"{host}:{port}: cannot listen there ({error.strerror}); wanted another --port or --host") from None
+
+
+@contextlib.contextmanager
+def serve(options: Play) -> Iterator[Page]:
+    """A page with a robot that is ready to be driven, until the context ends. Raises ValueError, RuntimeError, OSError."""
+    import viser
+
+    from bipedtrack import policy, robot
+    from bipedtrack.drive import Drive
+    from bipedtrack.page import Page
+    from bipedtrack.realtime import RealTime
+
+    require_free(options.host, options.port)
+    policies = choice(options.policy)
+    loaded = policy.load(next(iter(policies.values())), robot.load())
+    clock = RealTime(Drive(policy.Controller(loaded)))
+    server = viser.ViserServer(options.host, options.port, verbose=False)
+    clock.start()
+    try:
+        page = Page(server, clock, policies)
+        drawing = threading.Thread(target=page.run, name="drawing", daemon=True)
+        drawing.start()
+        try:
+            yield page
+        finally:
+            page.stop()
+            drawing.join(timeout=5)
+    finally:
+        clock.stop()
+        server.stop()
+
+
+def main() -> None:
+    """The command line. Exit status 0 after Ctrl-C; 2 for bad input."""
+    options = tyro.cli(Play, prog="python -m bipedtrack.play")
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    if importlib.util.find_spec("viser") is None:
+        fail("the page needs viser; wanted `pip install 'bipedtrack[play]'`")
+    if options.host not in LOOPBACK:
+        print(f"bipedtrack: --host {options.host}: whoever reaches this machine can drive the robot", file=sys.stderr)
+    try:
+        with contextlib.suppress(KeyboardInterrupt), serve(options):
+            print(f"drive the robot at http://{options.host}:{options.port} (Ctrl-C ends)", flush=True)
+            threading.Event().wait()
+    except (ValueError, RuntimeError, OSError) as error:
+        fail(str(error))
+
+
+if __name__ == "__main__":
+    main()

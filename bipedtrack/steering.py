@@ -1,0 +1,368 @@
+"""From what a person asks for to the next task step: steering, footholds by hand, and the ground under them.
+
+A task step is made of the cells of a footstep script's line, so that every drive can be written down as a script.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bipedtrack import footsteps, rotations
+from bipedtrack.footsteps import Box
+from bipedtrack.nodes import Nodes
+from bipedtrack.planner import TaskStep
+from bipedtrack.robot import LEGS, Robot
+
+FOOT_DISTANCE = 0.2  # m between the ankles of feet side by side
+HOLD_SECONDS = 0.1  # of a task step that holds: soon enough for the next wish
+TRUNK_SECONDS = 1.0  # of a task step that moves the trunk alone
+_BACKWARD = 0.15  # m, the longest step backward in training
+_RISE = 0.2  # m, the highest step up or down that is tried
+_REACH = 0.36  # m, the longest step onto a tread
+_HALF_TREAD = 0.15  # m from an edge to a foothold on ground that is longer than a tread
+_MARGIN = 0.02  # m between a sole and an edge
+_CLEARANCE = 0.06  # m by which a foot is lifted over what it crosses
+_BOX_SECONDS = 0.65  # at least, of a step that crosses an edge
+_HIGH_SWING = 0.4  # m, the longest way of a foot that is lifted higher than LIMITS
+_KNOWN = (0.35, 0.24, 0.35)  # m ahead, m outwards and rad from beside the other foot: the farthest foothold in training
+_GRAIN = 0.01  # m between two looks at the ground
+
+
+class Steering(NamedTuple):
+    """What is asked for; it holds from the next task step on."""
+
+    ahead: float = 0.0  # 1 forward, -1 backward
+    aside: float = 0.0  # 1 to the left, -1 to the right
+    turn: float = 0.0  # 1 to the left, -1 to the right
+    step_length: float = 0.15  # m the trunk advances per task step
+    sidle_length: float = 0.08  # m to the side per task step
+    turn_angle: float = 0.2  # rad per task step
+    period: float = footsteps.PERIOD  # s
+    lift: float = footsteps.LIFT  # m
+    trunk_ahead: float = 0.0  # m from midway between the feet, towards their mean heading
+    trunk_aside: float = 0.0  # m, to the left
+    trunk_height: float = footsteps.TRUNK_HEIGHT  # m above the mean of the footholds
+    trunk_roll: float = 0.0  # rad
+    trunk_pitch: float = 0.0  # rad
+    trunk_yaw: float = 0.0  # rad from the feet's mean heading
+
+    @property
+    def moves(self) -> bool:
+        """Whether feet are asked to step."""
+        return any((self.ahead, self.aside, self.turn))
+
+
+LIMITS = {
+    "step_length": (0.02, 0.25),
+    "sidle_length": (0.02, 0.12),
+    "turn_angle": (0.02, 0.35),
+    "period": (0.4, 0.7),
+    "lift": (0.04, 0.15),
+    "trunk_ahead": (-0.05, 0.05),
+    "trunk_aside": (-0.04, 0.04),
+    "trunk_height": (0.60, 0.79),
+    "trunk_roll": (-0.15, 0.15),
+    "trunk_pitch": (-0.15, 0.15),
+    "trunk_yaw": (-0.3, 0.3),
+}
+"""Least and greatest value of each number of Steering: what policies are trained for (tasks.Ranges)."""
+
+
+class Foothold(NamedTuple):
+    """A place for a foot."""
+
+    foot: int  # 0 left, 1 right
+    x: float  # m, of the point under the ankle
+    y: float
+    yaw: float  # rad
+
+
+class Planned(NamedTuple):
+    """A task step and, where it is not quite what was asked for, a sentence that says so."""
+
+    step: TaskStep
+    note: str = ""
+
+
+def clamped(asked: Steering) -> Steering:
+    """The same wishes within LIMITS; what is not finite becomes the default."""
+    values = {}
+    for name, value in asked._asdict().items():
+        low, high = LIMITS.get(name, (-1.0, 1.0))
+        default = Steering._field_defaults[name]
+        values[name] = min(max(float(value), low), high) if math.isfinite(value) else default
+    return Steering(**values)
+
+
+def first_foot(asked: Steering, otherwise: int) -> int:
+    """The foot that begins to walk as asked from a stand: to a side it is the one of that side."""
+    side = asked.aside or (0.0 if asked.ahead else asked.turn)
+    return otherwise if not side else int(side < 0)
+
+
+def beside(start: Nodes, foot: int) -> Foothold:
+    """Where the foot stands side by side with the other one."""
+    return _moved_on(start, foot, np.zeros(3))
+
+
+def walk(robot: Robot, boxes: Sequence[Box], start: Nodes, foot: int, asked: Steering) -> Planned:
+    """The task step that moves on as asked: the foot goes beside the other one, and on from there.
+
+    On boxes it goes to the middle of the next tread, or over a bar; a step that the robot cannot make is shortened.
+    """
+    # to a side the leading foot opens by twice the length and the other one closes up
+    leads = asked.aside * (0.5 - foot) > 0
+    advance = np.array(
+        [
+            max(asked.ahead * asked.step_length, -_BACKWARD),
+            2 * asked.aside * asked.sidle_length if leads else 0.0,
+            asked.turn * asked.turn_angle,
+        ]
+    )
+    problems: list[str] = []
+    for share in (1.0, 0.75, 0.5, 0.25, 0.0):
+        wanted = on_ground(robot, boxes, beside(start, foot), _moved_on(start, foot, share * advance))
+        step = step_to(robot, boxes, start, wanted, asked)
+        found = footsteps.problems_of(robot, boxes, step) or _too_long(step, foot)
+        if not found:
+            return Planned(step, f"a shorter step: {problems[0]}" if problems else "")
+        problems += found
+    return Planned(hold(robot, start), f"no step is possible: {problems[-1]}")
+
+
+def _too_long(step: TaskStep, foot: int) -> list[str]:
+    """What is wrong with a swing over something high: it must be short."""
+    travel = math.dist(step.start.ankle_positions[foot, :2], step.end.ankle_positions[foot, :2])
+    if step.lift[foot] <= LIMITS["lift"][1] or travel <= _HIGH_SWING:
+        return []
+    return [f"a foot lifted by {100 * step.lift[foot]:.0f} cm moves at most {100 * _HIGH_SWING:.0f} cm"]
+
+
+def step_to(robot: Robot, boxes: Sequence[Box], start: Nodes, to: Foothold, asked: Steering) -> TaskStep:
+    """The task step that puts a foot on the ground at a foothold, whether the robot can make it or not."""
+    ankles, yaws = start.ankle_positions.copy(), start.ankle_yaws.copy()
+    ankles[to.foot] = to.x, to.y, footsteps.ground(boxes, to.x, to.y) + robot.ankle_height
+    yaws[to.foot] = to.yaw
+    lift, uneven = _lift(robot, boxes, start, to, asked)
+    period = max(asked.period, _BOX_SECONDS) if uneven else asked.period
+    values = {"x": to.x, "y": to.y, "yaw": to.yaw, "period": period, "lift": lift}
+    return footsteps.task_step(robot, boxes, start, (to.foot,), values | _trunk(robot, ankles, yaws, asked))
+
+
+def trunk_step(robot: Robot, start: Nodes, asked: Steering) -> TaskStep:
+    """The task step that brings the trunk where it is asked to be over feet that stay."""
+    values = {"period": TRUNK_SECONDS, **_trunk(robot, start.ankle_positions, start.ankle_yaws, asked)}
+    return footsteps.task_step(robot, (), start, (), values)
+
+
+def hold(robot: Robot, start: Nodes) -> TaskStep:
+    """A short task step in which every target stays."""
+    return footsteps.task_step(robot, (), start, (), {"period": HOLD_SECONDS})
+
+
+def place(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold, asked: Steering) -> Planned:
+    """The task step to the foothold, or else to the nearest one that the robot can reach and stand on, and a note of it."""
+
+    def at(x: float, y: float) -> TaskStep:
+        return step_to(robot, boxes, start, wanted._replace(x=x, y=y), asked)
+
+    found_wrong = problems(robot, boxes, start, wanted, asked)
+    if not found_wrong:
+        return Planned(at(wanted.x, wanted.y))
+    home = beside(start, wanted.foot)
+    turned = home.yaw + min(max(rotations.wrap(wanted.yaw - home.yaw), -_KNOWN[2]), _KNOWN[2])
+    wanted = wanted._replace(yaw=float(turned))
+    found = nearest(
+        lambda point: not problems(robot, boxes, start, wanted._replace(x=point[0], y=point[1]), asked),
+        np.array([wanted.x, wanted.y]),
+        np.array([home.x, home.y]),
+    )
+    if found is None:
+        return Planned(hold(robot, start), f"no foothold is within reach: {found_wrong[0]}")
+    moved = 100 * math.dist(found, (wanted.x, wanted.y))
+    note = f"the {LEGS[wanted.foot]} foothold was moved by {moved:.0f} cm to the nearest one within reach: {found_wrong[0]}"
+    return Planned(at(*found), note)
+
+
+def problems(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold, asked: Steering) -> list[str]:
+    """What keeps the robot from a foothold, one sentence each: reach, ground, or a step longer than any in training."""
+    home = beside(start, wanted.foot)
+    x, y = _turned(-home.yaw, np.array([wanted.x - home.x, wanted.y - home.y]))
+    turn = rotations.wrap(wanted.yaw - home.yaw)
+    ahead, aside, around = _KNOWN
+    found = []
+    if math.hypot(x / ahead, y / aside) > 1.001 or abs(turn) > around + 1e-3:
+        found.append(
+            f"it lies {100 * x:.0f} cm ahead, {100 * abs(y):.0f} cm aside and {math.degrees(turn):.0f} deg from beside the "
+            f"other foot; wanted at most {100 * ahead:.0f} cm, {100 * aside:.0f} cm and {math.degrees(around):.0f} deg"
+        )
+    return found + footsteps.problems_of(robot, boxes, step_to(robot, boxes, start, wanted, asked))
+
+
+def nearest(possible: Callable[[np.ndarray], bool], wanted: np.ndarray, home: np.ndarray) -> np.ndarray | None:
+    """The possible point nearest to the wanted one, both (2,) m, to about 3 mm of distance; None where home is not possible.
+
+    The way from home ends where the possible ones do; from there every direction that leads nearer is tried.
+    """
+    best = home + _share(possible, wanted, home) * (wanted - home)
+    if not possible(best):
+        return None
+    turns = np.linspace(0, 2 * math.pi, 12, endpoint=False)
+    compass = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    stride = 0.05
+    while stride > 0.003:
+        nearer = [p for p in best + stride * compass if math.dist(p, wanted) < math.dist(best, wanted) - 1e-9]
+        nearer.sort(key=lambda point: math.dist(point, wanted))
+        better = next(filter(possible, nearer), None)
+        if better is None:
+            stride /= 2
+        else:
+            best = better
+    return best
+
+
+def lean(robot: Robot, boxes: Sequence[Box], start: Nodes, asked: Steering) -> tuple[Steering, str]:
+    """The wishes with the trunk within reach of both feet, and a note where it had to be brought nearer to its default."""
+    within = clamped(asked)
+    names = [name for name in Steering._fields if name.startswith("trunk")]
+    wanted, home = (np.array([getattr(wish, name) for name in names]) for wish in (within, Steering()))
+
+    def wish(trunk: np.ndarray) -> Steering:
+        return within._replace(**dict(zip(names, map(float, trunk), strict=True)))
+
+    def problems(trunk: np.ndarray) -> list[str]:
+        return footsteps.problems_of(robot, boxes, trunk_step(robot, start, wish(trunk)))
+
+    found = problems(wanted)
+    if not found:
+        note = "the trunk was kept within what the policy knows" if within != asked else ""
+        return within, note
+    share = _share(lambda trunk: not problems(trunk), wanted, home)
+    return wish(home + share * (wanted - home)), f"the trunk was brought back within reach: {found[0]}"
+
+
+def on_ground(robot: Robot, boxes: Sequence[Box], home: Foothold, wanted: Foothold) -> Foothold:
+    """A foothold on the way from home where the whole sole finds ground of one height, near the wanted one.
+
+    Where the way reaches an edge the foot goes to the middle of the next tread, or half a tread beyond the edge; from too
+    far away, or before what is too high, it stays half a tread before the edge.
+    """
+    if not boxes:
+        return wanted
+    way = np.array([wanted.x - home.x, wanted.y - home.y])
+    distance = float(np.hypot(*way))
+    direction = way / distance if distance > 1e-6 else np.array([math.cos(home.yaw), math.sin(home.yaw)])
+    cosine = abs(float(direction @ [math.cos(wanted.yaw), math.sin(wanted.yaw)]))
+    sine = math.sqrt(max(0.0, 1 - cosine * cosine))
+    half_length, half_width = robot.sole / 2
+    half = half_length * cosine + half_width * sine + _MARGIN
+    across = (half_length * sine + half_width * cosine) * np.array([-direction[1], direction[0]])
+
+    def height(s: float) -> float:
+        middle = np.array([home.x, home.y]) + s * direction
+        return max(footsteps.ground(boxes, *(middle + side * across)) for side in (-1, 0, 1))
+
+    stretches = _stretches(height, -0.3, max(distance, _REACH) + 0.3)
+    here = next(i for i, (_, end, _) in enumerate(stretches) if end > 0)
+    end, level = stretches[here][1:]
+    if distance + half <= end:
+        return wanted
+    reached = max(0.0, min(distance, end - _HALF_TREAD))
+    for first, last, top in stretches[here + 1 :]:
+        if abs(top - level) > _RISE:
+            break
+        if last - first >= 2 * half:
+            middle = first + min((last - first) / 2, _HALF_TREAD)
+            reached = middle if middle <= _REACH else reached
+            break
+    return wanted._replace(x=home.x + reached * direction[0], y=home.y + reached * direction[1])
+
+
+def _stretches(height: Callable[[float], float], first: float, last: float) -> list[tuple[float, float, float]]:
+    """Stretches of ground of one height along a way: begin, end and height of each, m."""
+    stretches: list[tuple[float, float, float]] = []
+    for s in np.arange(first, last, _GRAIN):
+        top = height(float(s))
+        if stretches and abs(stretches[-1][2] - top) < 1e-3:
+            stretches[-1] = (stretches[-1][0], float(s) + _GRAIN / 2, top)
+        else:
+            stretches.append((float(s) - _GRAIN / 2, float(s) + _GRAIN / 2, top))
+    return stretches
+
+
+def _moved_on(start: Nodes, foot: int, advance: np.ndarray) -> Foothold:
+    """The foothold beside the other foot, moved on by x m, y m and yaw rad, (3,), as `tasks` has it."""
+    stance = 1 - foot
+    position, yaw = start.ankle_positions[stance, :2], float(start.ankle_yaws[stance])
+    side = np.array([0.5, -0.5]) * FOOT_DISTANCE
+    middle = position + _turned(yaw, np.array([advance[0], advance[1] - side[stance]]))
+    x, y = middle + _turned(yaw + advance[2], np.array([0.0, side[foot]]))
+    return Foothold(foot, float(x), float(y), yaw + float(advance[2]))
+
+
+def _turned(yaw: float, vector: np.ndarray) -> np.ndarray:
+    """A vector (2,) turned about the vertical."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def _trunk(robot: Robot, ankles: np.ndarray, yaws: np.ndarray, asked: Steering) -> dict[str, float]:
+    """The trunk's cells of a script's line that ends with ankles (2, 3), m, and yaws (2,), rad."""
+    yaw = float(yaws.mean())
+    x, y = ankles[:, :2].mean(axis=0) + _turned(yaw, np.array([asked.trunk_ahead, asked.trunk_aside]))
+    return {
+        "trunk_x": float(x),
+        "trunk_y": float(y),
+        "trunk_z": float(ankles[:, 2].mean()) - robot.ankle_height + asked.trunk_height,
+        "trunk_roll": asked.trunk_roll,
+        "trunk_pitch": asked.trunk_pitch,
+        "trunk_yaw": yaw + asked.trunk_yaw,
+    }
+
+
+def _lift(robot: Robot, boxes: Sequence[Box], start: Nodes, to: Foothold, asked: Steering) -> tuple[float, bool]:
+    """The lift that clears what lies between where the foot stands and its foothold, m, and whether that is uneven."""
+    if not boxes:
+        return asked.lift, False
+    x, y, ankle = start.ankle_positions[to.foot]
+    way = np.linspace([x, y], [to.x, to.y], 2 + math.ceil(math.dist((x, y), (to.x, to.y)) / (2 * _GRAIN)))
+    heights = [footsteps.ground(boxes, *point) for point in way]
+    ends = max(float(ankle) - robot.ankle_height, heights[-1])
+    return max(asked.lift, max(heights) - ends + _CLEARANCE), max(heights) - min(heights) > 1e-3
+
+
+def _share(possible: Callable[[np.ndarray], bool], wanted: np.ndarray, home: np.ndarray) -> float:
+    """The greatest share of the way from home to the wanted point that is possible, to within 1 %."""
+    low, high = 0.0, 1.0
+    while high - low > 0.01:
+        middle = (low + high) / 2
+        low, high = (middle, high) if possible(home + middle * (wanted - home)) else (low, middle)
+    return low
+
+
+def same_trunk(start: Nodes, end: Nodes) -> bool:
+    """Whether the trunk is in the same place, to 1 mm and 1 mrad."""
+    apart = np.abs(end.trunk_position - start.trunk_position).max()
+    turn = rotations.multiply(rotations.conjugate(start.trunk_orientation), end.trunk_orientation)
+    return bool(apart < 1e-3 and np.abs(rotations.to_rotation_vector(turn)).max() < 1e-3)
+
+
+def trunk_at(robot: Robot, start: Nodes, position: np.ndarray, orientation: np.ndarray, asked: Steering) -> Steering:
+    """The wishes with the trunk at a place in the world: position (3,) m and quaternion (4,)."""
+    yaw = float(start.ankle_yaws.mean())
+    middle = start.ankle_positions.mean(axis=0) - np.array([0.0, 0.0, robot.ankle_height])
+    apart = np.asarray(position, float) - middle
+    ahead, aside = _turned(-yaw, apart[:2])
+    roll, pitch, turned = rotations.to_euler(np.asarray(orientation, float))
+    return asked._replace(
+        trunk_ahead=float(ahead),
+        trunk_aside=float(aside),
+        trunk_height=float(apart[2]),
+        trunk_roll=float(roll),
+        trunk_pitch=float(pitch),
+        trunk_yaw=float(rotations.wrap(turned - yaw)),
+    )

@@ -1,0 +1,137 @@
+"""A headless Chromium over its DevTools protocol: what a page asks for, shows, and does when keys are pressed."""
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+PROGRAM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-sync"),
+    *("--disable-component-update", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--mute-audio"),
+    *("--remote-debugging-port=0", "--window-size=640,420"),
+)
+
+
+def wait_until(holds: Callable[[], Any], seconds: float = 60.0) -> Any:
+    """What `holds` returns once that is true; an assertion fails after so many seconds."""
+    end = time.monotonic() + seconds
+    while not (found := holds()):
+        assert time.monotonic() < end, f"not within {seconds:g} s"
+        time.sleep(0.05)
+    return found
+
+
+class Tab:
+    """One page, its requests and its complaints."""
+
+    def __init__(self, url: str):
+        self._socket: ClientConnection = connect(url, max_size=None)
+        self._number = 0
+        self.requests: dict[str, str] = {}  # by id: url
+        self.failed: list[str] = []
+        self.errors: list[str] = []
+        for domain in ("Network", "Page", "Runtime"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """The result of a command; events that arrive meanwhile are noted."""
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                return message["result"]
+            self._note(message.get("method"), message.get("params", {}))
+
+    def _note(self, event: str | None, told: dict[str, Any]) -> None:
+        if event == "Network.requestWillBeSent":
+            self.requests[told["requestId"]] = told["request"]["url"]
+        elif event == "Network.webSocketCreated":
+            self.requests[told["requestId"]] = told["url"]
+        elif event == "Network.loadingFailed":
+            self.failed.append(f"{self.requests.get(told['requestId'])}: {told['errorText']}")
+        elif event == "Network.responseReceived" and told["response"]["status"] >= 400:
+            self.failed.append(f"{told['response']['url']}: {told['response']['status']}")
+        elif event == "Runtime.exceptionThrown":
+            self.errors.append(told["exceptionDetails"].get("exception", {}).get("description", "?"))
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of a JavaScript expression."""
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    @property
+    def text(self) -> str:
+        """What can be read on the page."""
+        return self.evaluate("document.body ? document.body.innerText : ''") or ""
+
+    def press(self, key: str) -> None:
+        """A key, down and up."""
+        code = "Space" if key == " " else f"Key{key.upper()}"
+        number = ord(key.upper())
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
+
+    def click(self, text: str) -> None:
+        """Clicks with the mouse on the button, tab or checkbox with exactly this text, once it is there."""
+        script = (
+            "(() => { for (const e of document.querySelectorAll('button, [role=tab], label')) {"
+            f" if (e.innerText.trim() !== {json.dumps(text)} || !e.getClientRects().length) continue;"
+            " e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
+            " return [b.x + b.width / 2, b.y + b.height / 2]; } return null; })()"
+        )
+
+        def at_rest() -> Any:
+            """Where it is, once the page has come to rest around it."""
+            before = self.evaluate(script)
+            time.sleep(0.2)
+            return before if before == self.evaluate(script) else None
+
+        x, y = wait_until(at_rest)
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def picture(self) -> bytes:
+        """A PNG of what is seen."""
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+
+    def close(self) -> None:
+        """Leaves the page."""
+        self._socket.close()
+
+
+class Chromium:
+    """The browser; a context that ends it."""
+
+    def __init__(self, profile: Path):
+        self._profile = profile
+
+    def __enter__(self) -> "Chromium":
+        command = [str(PROGRAM), *FLAGS, f"--user-data-dir={self._profile}", "about:blank"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self._process = subprocess.Popen(command, env={**os.environ, "HOME": str(self._profile)}, **quiet)  # type: ignore[call-overload]
+        port_file = self._profile / "DevToolsActivePort"
+        wait_until(lambda: port_file.is_file() and len(port_file.read_text().splitlines()) == 2, 60)
+        self._port = port_file.read_text().splitlines()[0]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        self._process.wait(timeout=20)
+
+    def open(self, address: str) -> Tab:
+        """A new tab at an address."""
+        request = urllib.request.Request(f"http://127.0.0.1:{self._port}/json/new?about:blank", method="PUT")
+        with urllib.request.urlopen(request, timeout=30) as answer:
+            tab = Tab(json.load(answer)["webSocketDebuggerUrl"])
+        tab.call("Page.navigate", url=address)
+        return tab

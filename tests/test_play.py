@@ -1,0 +1,314 @@
+"""The page in a real browser, its handles, and what the command line refuses."""
+
+import io
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import chromium
+import numpy as np
+import pytest
+from chromium import Chromium, Tab, wait_until
+from PIL import Image
+
+from bipedtrack import footsteps, play
+from bipedtrack import robot as robots
+from bipedtrack.drive import Drive, Mode
+from bipedtrack.steering import Steering
+
+pytest.importorskip("viser")
+from bipedtrack.page import Page  # noqa: E402
+from bipedtrack.scene import color_of, shape_of  # noqa: E402
+
+
+def free_port() -> int:
+    with socket.socket() as trial:
+        trial.bind(("127.0.0.1", 0))
+        return int(trial.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def page(port: int) -> Iterator[Page]:
+    with play.serve(play.Play(port=port)) as page:
+        yield page
+
+
+@pytest.fixture(autouse=True)
+def start(request: pytest.FixtureRequest) -> None:
+    """Every test of the page begins with a robot that stands at the start."""
+    if "page" in request.fixturenames:
+        page = request.getfixturevalue("page")
+        page.clock.ask(at_rest)
+
+
+def at_rest(drive: Drive) -> None:
+    drive.steering = Steering()
+    drive.reset(())
+
+
+def x_of(page: Page) -> float:
+    return float(page.clock.view.qpos[0])
+
+
+# Without a browser
+
+
+def test_the_clock_runs_at_real_time_without_a_viewer(page: Page) -> None:
+    began, at = time.perf_counter(), page.clock.ask(lambda drive: drive.view().time)
+    time.sleep(2.0)
+    passed = page.clock.ask(lambda drive: drive.view().time) - at
+    # never faster; slower only where other programs take the processor
+    assert 0.1 < passed < 1.1 * (time.perf_counter() - began)
+
+
+def test_a_foothold_out_of_reach_turns_red_and_the_robot_goes_to_the_nearest(page: Page) -> None:
+    handle = page.scene.foot
+    foot = page.clock.view.next_foot.foot
+    page._drag("foot", "start", page._place_foot, page._reaches_foot)
+    handle.position = np.array([0.2, 0.12 if foot == 0 else -0.12, 0.0])
+    page._drag("foot", "update", page._place_foot, page._reaches_foot)
+    assert tuple(page.scene._foot_plate.color) != (220, 30, 30)
+    handle.position = np.array([3.0, 0.1 if foot == 0 else -0.1, 0.0])
+    page._drag("foot", "update", page._place_foot, page._reaches_foot)
+    assert tuple(page.scene._foot_plate.color) == (220, 30, 30)
+    page._drag("foot", "end", page._place_foot, page._reaches_foot)
+    wait_until(lambda: page.clock.view.measured.ankle_positions[foot, 0] > 0.3)
+    assert page.clock.view.mode is Mode.STEER
+
+
+def test_the_trunk_follows_its_handle(page: Page) -> None:
+    page._drag("trunk", "start", page._place_trunk, page._reaches_trunk)
+    page.scene.trunk.position = np.array([0.0, 0.0, 0.68])
+    page._drag("trunk", "end", page._place_trunk, page._reaches_trunk)
+    assert page.clock.ask(lambda drive: drive.steering.trunk_height) == pytest.approx(0.68, abs=0.005)
+    wait_until(lambda: page.clock.view.qpos[2] < 0.71)
+
+
+def test_pause_slow_motion_and_single_steps(page: Page) -> None:
+    def seconds() -> float:
+        return float(page.clock.ask(lambda drive: drive.data.time))
+
+    page._toggle_pause()
+    at = seconds()
+    time.sleep(0.1)
+    assert seconds() <= at + 0.006  # the step that was under way
+    at = seconds()
+    page._single_step()
+    assert seconds() == pytest.approx(at + 0.005)
+    page.clock.speed = 0.25
+    page._toggle_pause()
+    at = seconds()
+    time.sleep(1.0)
+    assert 0.0 < seconds() - at < 0.5
+    page.clock.speed = 1.0
+
+
+def test_what_the_drive_refuses_reaches_the_one_who_asked(page: Page) -> None:
+    with pytest.raises(ValueError, match="wanted 0 to"):
+        page.clock.ask(lambda drive: drive.push(1e9))
+    page._ask(lambda drive: drive.push(1e9))  # the page says so and goes on
+    assert page.clock.ask(lambda drive: drive.mode) is Mode.STEER
+
+
+def test_shapes_are_those_of_the_mjcf(mj_model: object) -> None:
+    model = robots.build_model("ranger_max")
+    trunk = model.geom("trunk").id
+    assert np.allclose(shape_of(model, trunk).bounds, [[-0.15, -0.15, -0.075], [0.15, 0.15, 0.075]])
+    thigh = model.geom("left_thigh").id
+    assert np.allclose(shape_of(model, thigh).extents, [0.11, 0.11, 0.51], atol=0.005)
+    assert color_of(model, model.geom("left_foot").id) == (41, 115, 191)  # 0.16 0.45 0.75
+    with pytest.raises(ValueError, match="PLANE"):
+        shape_of(model, model.geom("floor").id)
+
+
+# The command line
+
+
+def refused(*arguments: str, **environment: str) -> str:
+    command = [sys.executable, "-m", "bipedtrack.play", *arguments]
+    place = Path(play.__file__).parent.parent
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}, cwd=place)
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    return done.stderr
+
+
+def test_a_missing_policy_is_refused_in_one_line() -> None:
+    assert "nowhere.npz" in refused("nowhere.npz")
+
+
+def test_a_port_in_use_is_refused_in_one_line() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"127.0.0.1:{port}: cannot listen there" in refused("--port", str(port))
+
+
+def test_it_serves_until_interrupted_and_warns_where_others_may_come_in() -> None:
+    command = [sys.executable, "-m", "bipedtrack.play", "--host", "127.0.0.2", "--port", str(free_port())]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, cwd=Path(play.__file__).parent.parent, **pipes) as running:  # type: ignore[call-overload]
+        for line in running.stdout:
+            if "http://127.0.0.2" in line and "Ctrl-C" in line:
+                break
+        running.send_signal(signal.SIGINT)
+        assert running.wait(timeout=60) == 0
+        assert "whoever reaches this machine" in running.stderr.read()
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "words"), [("127.0.0.1", 0, "1 to 65535"), ("no such host", 8080, "cannot listen")]
+)
+def test_an_address_that_cannot_be(host: str, port: int, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        play.require_free(host, port)
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["play"])
+    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as left:
+        play.main()
+    assert left.value.code == 2
+    assert "bipedtrack[play]" in capsys.readouterr().err
+
+
+def test_the_shipped_policy_comes_first_and_a_given_one_before_it(tmp_path: Path) -> None:
+    assert next(iter(play.choice(None))) == "first"
+    given = tmp_path / "mine.npz"
+    assert list(play.choice(given))[:2] == ["mine", "first"]
+    assert list(play.choice(tmp_path / "first.npz"))[0] == str(tmp_path / "first.npz")
+
+
+# In a browser
+
+browser_tests = pytest.mark.skipif(chromium.PROGRAM is None, reason="no Chromium on the PATH")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    with Chromium(tmp_path_factory.mktemp("chromium")) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Chromium, page: Page, port: int) -> Tab:
+    tab = browser.open(f"http://127.0.0.1:{port}")
+    wait_until(lambda: "real time" in tab.text)
+    return tab
+
+
+def is_blue(picture: bytes) -> np.ndarray:
+    """Which pixels left of the panel have the colour of the left leg."""
+    pixels = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"), int)
+    red, green, blue = np.moveaxis(pixels[:, : pixels.shape[1] // 2], -1, 0)
+    return (blue > red + 60) & (blue > green + 20)
+
+
+@browser_tests
+def test_the_canvas_shows_the_robot(tab: Tab) -> None:
+    wait_until(lambda: is_blue(tab.picture()).sum() > 100)
+
+
+@browser_tests
+def test_a_key_makes_it_walk_and_another_one_stops_it(tab: Tab, page: Page) -> None:
+    tab.press("i")
+    wait_until(lambda: x_of(page) > 0.3)
+    tab.press(" ")
+    wait_until(lambda: not page.clock.view.steering.moves)
+    time.sleep(2)
+    at = x_of(page)
+    time.sleep(0.5)
+    assert x_of(page) == pytest.approx(at, abs=0.02)
+
+
+@browser_tests
+def test_a_button_makes_it_walk(tab: Tab, page: Page) -> None:
+    tab.click("backward")
+    wait_until(lambda: x_of(page) < -0.2)
+    tab.click("stop and hold")
+    wait_until(lambda: not page.clock.view.steering.moves)
+
+
+@browser_tests
+def test_a_push_moves_it(tab: Tab, page: Page) -> None:
+    tab.click("Watch")
+    wait_until(lambda: "impulse" in tab.text)
+    at = page.clock.view.qpos[1]
+    tab.click("push")
+    wait_until(lambda: page.clock.view.qpos[1] > at + 0.01)
+
+
+def write(tab: Tab, page: Page, text: str) -> None:
+    """Replaces what stands in the editor."""
+    chosen = "(e => { if (e) { e.focus(); e.select(); return true } })(document.querySelector('textarea'))"
+    wait_until(lambda: tab.evaluate(chosen))
+    tab.call("Input.insertText", text=text)
+    wait_until(lambda: page._text.value == text)
+
+
+@browser_tests
+def test_a_bad_script_shows_its_error_and_a_good_one_runs_to_its_end(tab: Tab, page: Page) -> None:
+    tab.click("Scripts")
+    write(tab, page, "foot,x\nleft,far")
+    tab.click("run")
+    wait_until(lambda: "script:1: the header lacks" in tab.text)
+    assert page.clock.view.mode is Mode.STEER
+    write(tab, page, f"{','.join(footsteps.COLUMNS)}\nleft,0.1\nright,0.2\nleft,0.2")
+    tab.click("run")
+    wait_until(lambda: "the script is over" in tab.text)
+    assert x_of(page) == pytest.approx(0.2, abs=0.05)
+    assert "script:1" not in tab.text
+
+
+@browser_tests
+def test_two_viewers_see_the_same_and_one_that_leaves_changes_nothing(
+    tab: Tab, browser: Chromium, page: Page, port: int
+) -> None:
+    other = browser.open(f"http://127.0.0.1:{port}")
+    wait_until(lambda: "real time" in other.text)
+    wait_until(lambda: len(page._server.get_clients()) == 2)
+    other.press("k")
+    wait_until(lambda: x_of(page) < -0.1)
+    other.call("Page.close")
+    other.close()
+    wait_until(lambda: len(page._server.get_clients()) == 1)
+    at = x_of(page)
+    wait_until(lambda: x_of(page) < at - 0.1)
+    tab.press(" ")
+    wait_until(lambda: not page.clock.view.steering.moves)
+
+
+@browser_tests
+def test_nothing_failed_and_nothing_came_from_outside(tab: Tab, port: int) -> None:
+    """Comes last: it looks back on all requests of the page."""
+    own = re.compile(rf"(http|ws)://127\.0\.0\.1:{port}(/|$)|data:|blob:http://127\.0\.0\.1:{port}/")
+    assert tab.text
+    assert len(tab.requests) >= 2
+    assert [url[:100] for url in tab.requests.values() if not own.match(url)] == []
+    assert tab.failed == []
+    assert tab.errors == []
+
+
+@browser_tests
+def test_control_steps_are_short_under_a_busy_page(tab: Tab, page: Page, capsys: pytest.CaptureFixture[str]) -> None:
+    page._steer(ahead=1.0)
+    time.sleep(3.0)
+    pace = page.clock.pace
+    with capsys.disabled():
+        print(f"\ncontrol step: {pace.step_ms:.2f} ms, 99 %: {pace.step_p99_ms:.2f} ms, of work {pace.work_p99_ms:.2f} ms")
+    # the browser draws in software and other programs run: only the work can be held to the 5 ms of an idle machine
+    assert pace.work_p99_ms < 5.0
+    assert pace.step_ms < 5.0
