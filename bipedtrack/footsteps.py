@@ -341,7 +341,7 @@ def _task_step(robot: Robot, boxes: Iterable[Box], start: Nodes, row: _Row) -> T
     ankles, yaws = start.ankle_positions.copy(), start.ankle_yaws.copy()
     for foot in row.feet:
         x, y = given("x", ankles[foot, 0]), given("y", ankles[foot, 1])
-        ankles[foot] = x, y, given("z", _ground(boxes, x, y)) + robot.ankle_height
+        ankles[foot] = x, y, given("z", ground(boxes, x, y)) + robot.ankle_height
         yaws[foot] += rotations.wrap(given("yaw", yaws[foot]) - yaws[foot])
 
     holds = not row.feet and not any(column.startswith("trunk") for column in row.values)
@@ -396,7 +396,7 @@ def _foothold_problems(robot: Robot, boxes: dict[int, Box], nodes: Nodes, foot: 
         problems.append(f"{subject} overlaps {other} by {_cm(depth)}; wanted the soles of {size} apart")
     z = nodes.ankle_positions[foot, 2] - robot.ankle_height
     inside = _boxes_around(robot, boxes, nodes, foot)
-    gaps = [z - _ground(boxes.values(), x, y, z + _TOLERANCE) for x, y in soles[foot]]
+    gaps = [z - ground(boxes.values(), x, y, z + _TOLERANCE) for x, y in soles[foot]]
     if inside:
         for line in inside:
             right = f"wanted it on top, z = {boxes[line].top:g} m, or beside it"
@@ -453,7 +453,7 @@ def _deg(angle: float) -> str:
     return f"{math.degrees(angle):.1f} deg"
 
 
-def _ground(boxes: Iterable[Box], x: float, y: float, below: float = math.inf) -> float:
+def ground(boxes: Iterable[Box], x: float, y: float, below: float = math.inf) -> float:
     """The height of the ground at (x, y), m: the highest top that is not above `below`, or the floor."""
     return max([0.0] + [box.top for box in boxes if box.top <= below and _covers(box, x, y)])
 
