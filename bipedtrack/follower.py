@@ -120,6 +120,12 @@ class Follower:
         self._age += 1
         return Command(end, now, rates, timer)
 
+    def restart(self) -> Nodes:
+        """Forgets all packets and stands, at once, where it would have come to stand."""
+        self._target = self._to_standing().end
+        self._followed, self._step, self._time = None, self._to_standing(), 0
+        return self._target
+
     def _choose_step(self) -> None:
         """Begins a task step where packets stay away: to the end that the last one gave, then to standing."""
         if self._followed is None:
