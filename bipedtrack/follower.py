@@ -165,9 +165,7 @@ class Follower:
 
     def _reachable(self, nodes: Nodes, most: float = _FARTHEST_PROJECTION) -> Nodes:
         """The nodes with feet not under the ground and legs that reach. Raises Refused where an ankle moves by more, m."""
-        ankles = nodes.ankle_positions.copy()
-        ankles[:, 2] = np.maximum(ankles[:, 2], self._footing(nodes))
-        nodes = nodes._replace(ankle_positions=ankles)
+        nodes = nodes._replace(ankle_positions=self._on_the_ground(nodes))
         to_w = rotations.to_matrix(nodes.trunk_orientation)
         wanted, wanted_yaws = ankles_in_trunk_frame(nodes)
         nearest, yaws = kinematics.project(self.robot, wanted, wanted_yaws)
@@ -177,12 +175,17 @@ class Follower:
         shift[:, 2] -= common
         if np.linalg.norm(shift, axis=-1).max() > most:
             raise Refused("reach", f"an ankle is more than {most:g} m out of reach")
-        return Nodes(
+        nodes = Nodes(
             trunk_position=nodes.trunk_position - np.array([0.0, 0.0, common]),
             trunk_orientation=nodes.trunk_orientation,
-            ankle_positions=ankles + shift,
+            ankle_positions=nodes.ankle_positions + shift,
             ankle_yaws=nodes.ankle_yaws + rotations.wrap(yaws - wanted_yaws),
         )
+        return nodes._replace(ankle_positions=self._on_the_ground(nodes))
+
+    def _on_the_ground(self, nodes: Nodes) -> np.ndarray:
+        """The ankles (2, 3), m, none so low that its foot would be under the ground."""
+        return np.column_stack([nodes.ankle_positions[:, :2], np.maximum(nodes.ankle_positions[:, 2], self._footing(nodes))])
 
     def _to_end(self, end: Nodes, remaining: np.ndarray) -> TaskStep:
         """The rest of a task step to the end that a packet gave, whose feet land after (2,) remaining s."""

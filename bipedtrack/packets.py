@@ -102,7 +102,8 @@ def _unpacked(datagram: bytes) -> Packet:
     _check_version(version)
     if flags > _HAS_RATES | _HAS_END | _REPLY:
         raise Refused("field", f"unknown flags {flags:#x}")
-    numbers = np.frombuffer(datagram, "<f4", offset=_HEADER.size).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling nan
+        numbers = np.frombuffer(datagram, "<f4", offset=_HEADER.size).astype(np.float64)
     target, rates, end, timer = np.split(numbers, [15, 29, 44])
     return Packet(
         sequence,
