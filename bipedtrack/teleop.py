@@ -41,7 +41,7 @@ PORT = 47200
 _READ = 64  # datagrams read in a control step: what is beyond waits in the socket's buffer or is lost
 _DECODED = 4  # datagrams decoded in a control step: the newest
 _BACKLOG = 0.1  # s behind real time that are caught up
-_LEVEL_GROUND = footsteps.Script("level ground", (), (), ())
+LEVEL_GROUND = footsteps.Script("level ground", (), (), ())
 
 
 class Receiver:
@@ -71,7 +71,8 @@ class Receiver:
             if self._sender not in (None, sender):
                 self.refused["source"] += 1
                 continue
-            self.refused["flood"] += len(newest) == _DECODED
+            if len(newest) == _DECODED:
+                self.refused["flood"] += 1
             newest.append((datagram, sender))
         asked = None
         for datagram, sender in newest:
@@ -103,6 +104,7 @@ class Teleoperation:
         self.controller, self.robot = controller, controller.policy.robot
         self.model, self.data = simulate.model_and_data(script)
         start = footsteps.initial_nodes(self.robot)
+        self.address = source.getsockname()
         self.receiver = Receiver(source, follower.Follower(self.robot, start, script.boxes, hold))
         self.falls = 0
         controller.reset(self.data.qpos)
@@ -138,7 +140,7 @@ class Teleoperation:
         """The status line after a second in which so many packets were followed, at a share of real time."""
         receiver = self.receiver
         age = f"last {receiver.silent * self.robot.timestep:.2f} s ago" if receiver.accepted else "none yet"
-        refused = ", ".join(f"{count} {reason}" for reason, count in receiver.refused.most_common() if count) or "none"
+        refused = ", ".join(f"{count} {reason}" for reason, count in receiver.refused.most_common()) or "none"
         return (
             f"{self.data.time:6.1f} s  {receiver.follower.state:<9}  {followed} packets/s, {age}; refused: {refused}; "
             f"falls: {self.falls}; {realtime:.2f} of real time"
@@ -182,7 +184,10 @@ class Teleoperation:
 
 def listen(host: str, port: int) -> socket.socket:
     """A UDP socket bound to an address, after a warning where that is not this computer's own. Raises OSError."""
-    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    except socket.gaierror as error:
+        raise OSError(f"--host {host}: {error.strerror}") from None
     if not ipaddress.ip_address(address[0]).is_loopback:
         print(
             f"bipedtrack: warning: any computer that reaches {host} can steer the robot; nothing is signed", file=sys.stderr
@@ -231,7 +236,7 @@ def main() -> None:
         if options.record is not None and not options.record.parent.is_dir():
             raise ValueError(f"--record {options.record}: there is no such folder")
         the_robot = robot.load()
-        script = footsteps.load(options.ground, the_robot) if options.ground else _LEVEL_GROUND
+        script = footsteps.load(options.ground, the_robot) if options.ground else LEVEL_GROUND
         file = options.policy or paths.data_dir("models") / "policies" / "first.npz"
         controller = policy.Controller.load(file, the_robot)
         rows: list[list[Any]] | None = [] if options.record else None
