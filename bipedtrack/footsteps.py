@@ -184,7 +184,7 @@ def initial_nodes(robot: Robot) -> Nodes:
         ankle_positions=np.array([[0.0, y, robot.ankle_height] for y in FEET_Y]),
         ankle_yaws=np.zeros(2),
     )
-    return _balanced(robot, upright)
+    return balanced(robot, upright)
 
 
 def initial_qpos(robot: Robot) -> np.ndarray:
@@ -378,11 +378,11 @@ def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray,
     orientation = rotations.from_euler(*angles)
     if orientation @ start.trunk_orientation < 0:  # of the two quaternions the one that goes on from the last
         orientation = -orientation
-    x, y = _balanced(robot, Nodes(np.array([x, y, z]), orientation, ankles, yaws)).trunk_position[:2]
+    x, y = balanced(robot, Nodes(np.array([x, y, z]), orientation, ankles, yaws)).trunk_position[:2]
     return Nodes(np.array([given("trunk_x", x), given("trunk_y", y), z]), orientation, ankles, yaws)
 
 
-def _balanced(robot: Robot, nodes: Nodes) -> Nodes:
+def balanced(robot: Robot, nodes: Nodes) -> Nodes:
     """The nodes with the trunk moved level until the centre of mass stands over the feet's middle."""
     for _ in range(3):
         nodes = kinematics.balanced(robot, nodes, nodes.ankle_positions.mean(axis=0)[:2])

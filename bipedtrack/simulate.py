@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from bipedtrack import footsteps, kinematics, nodes, policy, robot, trace
+from bipedtrack import footsteps, kinematics, nodes, planner, policy, robot, trace
 from bipedtrack.messages import fail
 from bipedtrack.rewards import stationary
 
@@ -37,23 +37,36 @@ def record(controller: policy.Controller, script: footsteps.Script, seconds: flo
 
     The trace has no axis of robots. It ends with a fall: a trunk tilted by more than 60 deg or a state that is not finite.
     """
-    import mujoco
-
     model, data = model_and_data(script)
     controller.reset(data.qpos)
     rows: list[list[Any]] = []
     for command in footsteps.commands(script, model.opt.timestep, seconds):
-        state = [data.time, data.qpos.copy(), data.qvel.copy()]
-        measured = kinematics.measure(controller.policy.robot, state[1])
-        upright = 1 - 2 * (data.qpos[4] ** 2 + data.qpos[5] ** 2)
-        alive = bool(upright > 0.5)  # cos 60 deg; false for nan
-        targets = controller.step(data.qpos, data.qvel, command)
-        data.ctrl[:] = targets
-        mujoco.mj_step(model, data)
-        answer = [controller.last_feedback, targets, data.actuator_force.copy(), data.sensordata.copy()]
-        rows.append([*state, command.target, measured, command.timer, stationary(command.rates), *answer, alive])
-        if not alive:
+        rows.append(control_step(controller, model, data, command))
+        if not rows[-1][-1]:
             break
+    return to_trace(rows)
+
+
+def control_step(controller: policy.Controller, model: Any, data: Any, command: planner.Command) -> list[Any]:
+    """Carries out a command for 0.005 s and gives what a trace keeps of it, by the order of its fields.
+
+    The last one is whether the robot was up. With a state that is not finite the joint targets stay as they were.
+    """
+    import mujoco
+
+    state = [data.time, data.qpos.copy(), data.qvel.copy()]
+    measured = kinematics.measure(controller.policy.robot, state[1])
+    upright = 1 - 2 * (data.qpos[4] ** 2 + data.qpos[5] ** 2)
+    alive = bool(upright > 0.5)  # cos 60 deg; false for nan
+    if np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all():
+        data.ctrl[:] = controller.step(data.qpos, data.qvel, command)
+    mujoco.mj_step(model, data)
+    answer = [controller.last_feedback, data.ctrl.copy(), data.actuator_force.copy(), data.sensordata.copy()]
+    return [*state, command.target, measured, command.timer, stationary(command.rates), *answer, alive]
+
+
+def to_trace(rows: list[list[Any]]) -> trace.Trace:
+    """The trace of control steps, at least one."""
     return trace.Trace(*(_stack(column) for column in zip(*rows, strict=True)))
 
 

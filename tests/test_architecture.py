@@ -18,17 +18,19 @@ LADDER = """
     compilation
     config checkpoint
     rotations robot
-    nodes kinematics trace
+    nodes kinematics trace packets
     planner terrain
     tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
-    policy onnx_export env autoreset
+    policy follower onnx_export env autoreset
     curriculum rollout progress recording suite
     training evaluation report
-    doctor train export evaluate simulate video drive realtime scene page play __main__
+    doctor train export evaluate simulate video teleop drive realtime scene page play __main__
 """.split()
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
-DEPLOYMENT = "rotations nodes kinematics planner control observation policy footsteps robot config checkpoint".split()
+DEPLOYMENT = (
+    "rotations nodes kinematics planner control observation policy footsteps packets follower robot config checkpoint"
+).split()
 ABSENT = ("jax", "flax", "brax", "optax", "mujoco")
 
 
