@@ -165,6 +165,9 @@ def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: boo
             friction=[1, 0.005, 0.0001],
             rgba=[0.62, 0.60, 0.56, 1],
         )
+    if boxes:
+        # MJX would solve for every sphere against every box; of 16 contacts, the deepest, two are left for each sphere
+        spec.add_numeric(name="max_contact_points", data=[16], size=1)
     if touch:
         for leg in LEGS:
             zone = f"{leg}_foot_zone"
