@@ -201,8 +201,7 @@ class Follower:
         ankles[:, 2] = self._footing(start)
         yaw = start.ankle_yaws[0] + rotations.wrap(start.ankle_yaws[1] - start.ankle_yaws[0]) / 2
         trunk = ankles.mean(axis=0) + np.array([0.0, 0.0, footsteps.TRUNK_HEIGHT - self.robot.ankle_height])
-        upright = footsteps.balanced(self.robot, Nodes(trunk, rotations.from_yaw(yaw), ankles, start.ankle_yaws))
-        end = self._reachable(upright, math.inf)
+        end = self._reachable(Nodes(trunk, rotations.from_yaw(yaw), ankles, start.ankle_yaws), math.inf)
         way = _rates_towards(start, end, 1.0, limited=False)
         seconds = max(_SHORTEST_WAY, *(float(speed(part).max() / calm) for part, calm in zip(way, _CALM, strict=True)))
         lifted = start.ankle_positions[:, 2] - ankles[:, 2] > _LIFTED

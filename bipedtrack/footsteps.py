@@ -177,14 +177,13 @@ def parse(text: str, robot: Robot, name: str) -> Script:
 
 
 def initial_nodes(robot: Robot) -> Nodes:
-    """Where every script starts: feet side by side on the ground, facing x, the centre of mass between them; float64."""
-    upright = Nodes(
+    """Where every script starts: feet side by side on the ground, facing x, the trunk over them; float64."""
+    return Nodes(
         trunk_position=np.array([0.0, 0.0, TRUNK_HEIGHT]),
         trunk_orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         ankle_positions=np.array([[0.0, y, robot.ankle_height] for y in FEET_Y]),
         ankle_yaws=np.zeros(2),
     )
-    return balanced(robot, upright)
 
 
 def initial_qpos(robot: Robot) -> np.ndarray:
@@ -370,23 +369,16 @@ def task_step(
 
 
 def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: Mapping[str, float]) -> Nodes:
-    """Nodes with the trunk where `values` say, or else with the centre of mass over the feet's middle."""
+    """Nodes with the trunk where `values` say, or else over the feet."""
     given = values.get
     x, y, z = ankles.mean(axis=0)
-    z = given("trunk_z", z + TRUNK_HEIGHT - robot.ankle_height)
+    z += TRUNK_HEIGHT - robot.ankle_height
     angles = given("trunk_roll", 0.0), given("trunk_pitch", 0.0), given("trunk_yaw", yaws.mean())
     orientation = rotations.from_euler(*angles)
     if orientation @ start.trunk_orientation < 0:  # of the two quaternions the one that goes on from the last
         orientation = -orientation
-    x, y = balanced(robot, Nodes(np.array([x, y, z]), orientation, ankles, yaws)).trunk_position[:2]
-    return Nodes(np.array([given("trunk_x", x), given("trunk_y", y), z]), orientation, ankles, yaws)
-
-
-def balanced(robot: Robot, nodes: Nodes) -> Nodes:
-    """The nodes with the trunk moved level until the centre of mass stands over the feet's middle."""
-    for _ in range(3):
-        nodes = kinematics.balanced(robot, nodes, nodes.ankle_positions.mean(axis=0)[:2])
-    return nodes
+    position = np.array([given("trunk_x", x), given("trunk_y", y), given("trunk_z", z)])
+    return Nodes(position, orientation, ankles, yaws)
 
 
 def problems_of(robot: Robot, boxes: Sequence[Box], step: TaskStep) -> list[str]:

@@ -46,6 +46,7 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, difficulty:
         stage.hold_after,
         mix_share=stage.mix_share,
         push_share=stage.push_share,
+        balance=float(config.balanced_steps),
     )
     settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
     return env.TrackingEnv(robot.load(config.robot), settings, given)

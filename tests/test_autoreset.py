@@ -142,9 +142,9 @@ def test_every_episode_is_another_one(recording: Recording) -> None:
         state = recording.states[t]
         episode = state.info["episode"]
         seen["key"].add(np.asarray(episode.key)[i].tobytes())
-        seen["task"].add(np.asarray(episode.task.period)[i].tobytes())
+        seen["task"].add(np.asarray(episode.task.motion.period)[i].tobytes())
         seen["posture"].add(np.asarray(episode.step.ankle_points)[i].tobytes())
-        kinds.add(int(episode.task.kind[i]))
+        kinds.add(int(episode.task.motion.kind[i]))
     assert len(begun) > 25 and {name: len(values) for name, values in seen.items()} == dict.fromkeys(seen, len(begun))
     assert kinds == {tasks.STAND, tasks.SQUAT, tasks.WALK, tasks.SIDLE, tasks.TURN}
 

@@ -66,14 +66,10 @@ def test_steps_are_those_of_training(robot: robots.Robot) -> None:
     start = footsteps.initial_nodes(robot)
     for foot in range(2):
         for ahead, turn in ((0.2, 0.0), (-0.1, 0.25), (0.0, -0.35)):
-            task = tasks.Task(2, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75, _no_stairs(), 9)
-            places, yaws = tasks._foothold(task, 0, task.advance, start)
+            motion = tasks.Motion(tasks.WALK, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75)
+            places, yaws = tasks._foothold(motion, 0.0, 0, motion.advance, start)
             mine = steering._moved_on(start, foot, np.array([ahead, 0.0, turn]))
             assert np.allclose(mine[1:], [*places[foot][:2], yaws[foot]], atol=1e-6)
-
-
-def _no_stairs() -> tasks.terrain.Stairs:
-    return tasks.terrain.Stairs(0.0, 0.3, 0.0)
 
 
 def test_limits_are_those_of_training() -> None:

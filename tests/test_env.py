@@ -217,7 +217,7 @@ def test_one_program_serves_every_kind_and_difficulty(flat: Compiled, mixed: lis
     flat.step(hard, jnp.zeros((ROBOTS, 12)))
     assert flat.traces == ["begin", "step"]
     tasks_of = [state.info["episode"].task for state in (hard, easy)]
-    assert np.ptp(tasks_of[0].period) > 0.05 and np.ptp(tasks_of[1].period) == 0
+    assert np.ptp(tasks_of[0].motion.period) > 0.05 and np.ptp(tasks_of[1].motion.period) == 0
 
 
 # Physics
