@@ -11,6 +11,7 @@ import dataclasses
 import importlib.util
 import os
 import pathlib
+import signal
 import socket
 import sys
 import threading
@@ -111,6 +112,7 @@ def main() -> None:
         fail("the page needs viser; wanted `pip install 'bipedtrack[play]'`")
     if options.host not in LOOPBACK:
         print(f"bipedtrack: --host {options.host}: whoever reaches this machine can drive the robot", file=sys.stderr)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs would ignore Ctrl-C's signal
     try:
         with contextlib.suppress(KeyboardInterrupt), serve(options):
             print(f"drive the robot at http://{options.host}:{options.port} (Ctrl-C ends)", flush=True)

@@ -164,7 +164,10 @@ def test_it_serves_until_interrupted_and_warns_where_others_may_come_in() -> Non
             if "http://127.0.0.2" in line and "Ctrl-C" in line:
                 break
         running.send_signal(signal.SIGINT)
-        assert running.wait(timeout=60) == 0
+        try:
+            assert running.wait(timeout=60) == 0
+        finally:
+            running.kill()
         assert "whoever reaches this machine" in running.stderr.read()
 
 
