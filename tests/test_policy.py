@@ -228,7 +228,7 @@ def test_in_mujoco_c_a_script_is_walked_as_in_mjx(env_50_hz, walk):
     env, begin, step = env_50_hz
     no_choice = drawn("walk", ranges=tasks.Ranges()._replace(walk_step=(0.1, 0.1, 0.1)), difficulty=0.0)
     starts = (begin(jax.random.PRNGKey(seed), no_choice) for seed in range(20))
-    start = next(start for start in starts if start.info["episode"].task.first == 0)  # the left foot steps first
+    start = next(start for start in starts if start.info["episode"].task.motion.first == 0)  # the left foot steps first
     commands = list(footsteps.commands(walk, ROBOT.timestep, 1.0))
     worst = np.array([apart(env, start, step, commands, random_network(seed, output=0.5)) for seed in range(5)])
     # Measured: a median of 2e-6, and 3e-4 to 7e-4 in one walk of fourteen, where a corner of a sole grazes the ground and
