@@ -258,7 +258,7 @@ def test_mjx_and_mujoco_c_agree(in_mjx: Trace, in_c: InC) -> None:
     compared = np.array([*STAND, *WALK])
     mjx, c = (trace.episode(compared) for trace in (in_mjx, in_c.trace))
     apart = np.abs(mjx.qpos - c.qpos).max(axis=-1)
-    # measured median: 2e-3; where a sole just touches at first, rounding decides when it does
+    # measured median: 2e-3, and 3e-6 before postures were balanced; why is not known (the limit on contacts: no)
     assert np.median(apart[:, :61].max(axis=1)) < 5e-3 and np.isfinite(apart).all()
     moved = np.abs(c.qpos[:, 60] - c.qpos[:, 0]).max(axis=1)
     assert np.median(moved) > 0.05
