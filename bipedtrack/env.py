@@ -57,6 +57,9 @@ class Physics(NamedTuple):
     sensors: Array  # what the model's sensors read in the last step; none in training
 
 
+_TOUCH = 5e-6  # m, several times the rounding of float32 at the heights and distances of an episode
+
+
 class Episode(NamedTuple):
     """What one robot's episode remembers beside its physics."""
 
@@ -82,11 +85,15 @@ class Answer(NamedTuple):
 def standing(
     the_robot: robot.Robot, settings: control.ControlConfig, start: nodes.Nodes
 ) -> tuple[Array, control.ControlState]:
-    """A robot, qpos (19,), with its nodes at `start` by inverse kinematics and its soles level, and its controller."""
+    """A robot, qpos (19,), with its nodes at `start` by inverse kinematics and its soles level, and its controller.
+
+    It stands lower by _TOUCH, m: of soles at exactly the ground's height rounding would decide which of them touch.
+    """
     level = control.feedforward(the_robot, dataclasses.replace(settings, level_feet=True), start)
     joints = control.denormalize(the_robot, jnp.clip(level, -1.0, 1.0))
     memory = control.initial(level, control.feedforward(the_robot, settings, start))
-    return jnp.concatenate([start.trunk_position, start.trunk_orientation, joints]), memory
+    position = start.trunk_position - jnp.array([0.0, 0.0, _TOUCH])
+    return jnp.concatenate([position, start.trunk_orientation, joints]), memory
 
 
 class TrackingEnv(brax.envs.Env):

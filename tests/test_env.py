@@ -204,7 +204,7 @@ def test_a_robot_that_stands_on_its_target_has_no_errors(mixed: list[Any]) -> No
     slices, first = observation.layout(), np.asarray(mixed[0].obs)
     level = [i for i, kind in enumerate(KINDS) if kind not in ("stand", "squat")]
     for part in ("trunk_position", "trunk_orientation", "ankle_positions"):
-        assert np.abs(first[:, slices[f"target_{part}"]]).max() < 2e-6
+        assert np.abs(first[:, slices[f"target_{part}"]]).max() < 7e-6  # it starts 5 um deep in the ground
     # levelling the soles under a tilted trunk turns them a little
     assert np.abs(first[:, slices["target_ankle_yaws"]]).max() < 0.01
     assert np.abs(first[level, slices["target_ankle_yaws"]]).max() < 2e-6
