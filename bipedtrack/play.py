@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
@@ -116,7 +117,8 @@ def main() -> None:
     try:
         with contextlib.suppress(KeyboardInterrupt), serve(options):
             print(f"drive the robot at http://{options.host}:{options.port} (Ctrl-C ends)", flush=True)
-            threading.Event().wait()
+            while True:
+                time.sleep(0.5)  # a signal that another thread got is handled when this one wakes
     except (ValueError, RuntimeError, OSError) as error:
         fail(str(error))
 
