@@ -162,7 +162,7 @@ def test_the_run_directory_says_what_was_trained_and_how_it_went(runs: Runs) -> 
     assert settings["curriculum"]["ppo"]["discount"] == 0.98 and settings["versions"]["brax"] == "0.14.2"
     rows = [json.loads(line) for line in (runs.whole / "progress.jsonl").read_text().splitlines()]
     assert [row["call"] for row in rows] == [0, 1, 2]
-    assert [row["steps"] for row in rows] == [160, 352, 544]
+    assert [row["steps"] for row in rows] == [192, 384, 576]
     for row in rows:
         assert 0.02 <= row["episode_seconds"] <= 0.4 + 1e-6 and 0 <= row["falls"] <= 1 and row["nonfinite"] == 0
         assert 0 < row["live"] <= 1 and row["reward_per_step"] > 0 and row["policy_dist_mean_std"] > 0.5
