@@ -124,7 +124,7 @@ def main(options: Rollout) -> None:
         measure.line(benchmark="rollout", case="MuJoCo C", threads=threads, robots=256, rate=rate)
     grounds = {"flat": plan.stages[0], "stairs": plan.stages[1]}
     for ground in ("flat", "stairs") if options.stairs else ("flat",):
-        the_env = training.make_env(plan, grounds[ground], 0.5)
+        the_env = training.make_env(plan, grounds[ground], grounds[ground].lessons[0])
         for robots in options.robots:
             case = {"benchmark": "rollout", "ground": ground, "robots": robots, "steps": options.steps}
             alone = mjx_alone(the_env, robots, options.steps, devices)

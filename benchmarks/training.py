@@ -44,7 +44,7 @@ def main(options: Training) -> None:
     config = curriculum.load(options.curriculum)
     stage = config.stages[options.stage]
     call = next(call for call in curriculum.calls(config) if call.stage is stage)
-    the_env = training.make_env(config, stage, call.lesson.difficulty)
+    the_env = training.make_env(config, stage, call.lesson)
     robots, steps = config.ppo.num_envs, config.ppo.unroll_length * the_env.substeps
 
     driven = policy.load(options.policy, robot.load())

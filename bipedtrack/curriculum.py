@@ -78,12 +78,15 @@ class Lesson:
     steps: int  # policy steps, over all environments
     difficulty: float  # 0 the mildest, 1 the full ranges
     parts: int = 1  # PPO calls that share the steps; a killed run repeats at most one
+    push_share: float = 0.0  # share of the episodes with pushes
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.parts < 1:
             raise ValueError("steps and parts must be at least 1")
         if not 0 <= self.difficulty <= 1:
             raise ValueError(f"difficulty must lie in [0, 1], not {self.difficulty}")
+        if not 0 <= self.push_share <= 1:
+            raise ValueError(f"push_share must lie in [0, 1], not {self.push_share}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,14 +102,13 @@ class Stage:
     hold_share: float = 0.0  # share of the episodes that stop after some task steps and hold
     hold_after: tuple[int, int] = (1, 8)  # least and greatest number of task steps before a hold
     mix_share: float = 0.0  # share of the episodes on level ground that change their kind every few task steps
-    push_share: float = 0.0  # share of the episodes with pushes
 
     def __post_init__(self) -> None:
         if not self.lessons:
             raise ValueError(f"stage {self.name!r} has no lessons")
         if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon) < 0:
             raise ValueError("learning_rate, entropy_cost and clipping_epsilon must not be negative")
-        for name in ("hold_share", "mix_share", "push_share"):
+        for name in ("hold_share", "mix_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:

@@ -36,16 +36,16 @@ class Stopped(Exception):
     """Somebody asked the training to stop; everything up to the last finished call is saved."""
 
 
-def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, difficulty: float) -> env.TrackingEnv:
-    """The environment of a stage at a difficulty; only a stage with stairs has boxes."""
+def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: curriculum.Lesson) -> env.TrackingEnv:
+    """The environment of a stage's lesson; only a stage with stairs has boxes."""
     given = tasks.distribution(
         config.ranges,
         stage.shares,
-        difficulty,
+        lesson.difficulty,
         stage.hold_share,
         stage.hold_after,
         mix_share=stage.mix_share,
-        push_share=stage.push_share,
+        push_share=lesson.push_share,
         balance=float(config.balanced_steps),
     )
     settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
@@ -87,7 +87,7 @@ def _run_call(
     ppo_config = config.ppo
     updates = math.ceil(call.steps / ppo_config.steps_per_update)
     epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
-    the_env = make_env(config, call.stage, call.lesson.difficulty)
+    the_env = make_env(config, call.stage, call.lesson)
 
     def report(steps: int, metrics: dict[str, Any]) -> None:
         progress.update(call, steps, _figures(metrics, config.policy_period))

@@ -212,10 +212,10 @@ def test_every_call_of_every_run_has_a_seed_of_its_own() -> None:
 
 def test_only_a_stage_with_stairs_pays_for_boxes() -> None:
     config = curriculum.load("smoke")
-    envs = [training.make_env(config, stage, stage.lessons[0].difficulty) for stage in config.stages]
+    envs = [training.make_env(config, stage, stage.lessons[0]) for stage in config.stages]
     assert [env.mj_model.nmocap for env in envs] == [0, 3, 3]
     assert [float(env.given.hold_share) for env in envs] == pytest.approx([0, 0, 0.6])
-    harder = training.make_env(config, config.stages[0], 1.0)
+    harder = training.make_env(config, config.stages[0], dataclasses.replace(config.stages[0].lessons[0], difficulty=1.0))
     step = config.ranges.walk_step
     np.testing.assert_allclose(envs[0].given.ranges["walk_step"], [0.5 * step[0], 0.5 * step[2]], atol=1e-7)
     np.testing.assert_allclose(harder.given.ranges["walk_step"], [step[0], step[2]], atol=1e-7)
