@@ -172,20 +172,23 @@ class Call:
 
 
 def calls(curriculum: Curriculum) -> tuple[Call, ...]:
-    """The PPO calls of a curriculum in order, each with the values at its middle of its stage's falling line."""
+    """The PPO calls of a curriculum in order, with the values of its stage's falling lines at the middle of its lesson.
+
+    They are constants of the compiled program, so that the parts of a lesson share one.
+    """
     found: list[Call] = []
     for stage in curriculum.stages:
         done = 0
         for lesson in stage.lessons:
+            along = (done + lesson.steps / 2) / stage.steps
+            rate, entropy, epsilon = (
+                start + along * (end - start)
+                for start, end in (stage.learning_rate, stage.entropy_cost, stage.clipping_epsilon)
+            )
             for part in range(lesson.parts):
                 steps = lesson.steps // lesson.parts + (part < lesson.steps % lesson.parts)
-                along = (done + steps / 2) / stage.steps
-                rate, entropy, epsilon = (
-                    start + along * (end - start)
-                    for start, end in (stage.learning_rate, stage.entropy_cost, stage.clipping_epsilon)
-                )
                 found.append(Call(len(found), stage, lesson, steps, rate, entropy, epsilon))
-                done += steps
+            done += lesson.steps
     return tuple(found)
 
 
