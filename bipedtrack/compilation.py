@@ -10,6 +10,9 @@ import platform
 from bipedtrack import versions
 
 _SHORTEST = 1.0  # s of compiling that are worth a file
+# XLA calls every kept program dangerous, for lack of CPU features that it made up itself (+prefer-no-gather); jax reads this
+# when it is imported
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def use_cache() -> pathlib.Path | None:
