@@ -124,8 +124,9 @@ class TrackingEnv(brax.envs.Env):
         if boxes is None:
             boxes = [terrain.STAIR_BOX] * terrain.STAIR_BOXES if config.stairs else []
         self.mj_model = robot.build_model(the_robot.name, boxes, touch=touch)
-        self.mjx_model = mjx.put_model(self.mj_model)
-        self._blank = mjx.make_data(self.mj_model)
+        device = jax.local_devices()[0]  # by default mjx takes the first of all processes
+        self.mjx_model = mjx.put_model(self.mj_model, device)
+        self._blank = mjx.make_data(self.mj_model, device)
 
     @property
     def observation_size(self) -> int:

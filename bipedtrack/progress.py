@@ -101,3 +101,21 @@ class Progress:
         elif doing != "training" or time.monotonic() - self._spoke > _LINE_EVERY:
             self._spoke = time.monotonic()
             self.say(" | ".join(text.strip() for text in shown.values() if text.strip()))
+
+
+class Aside:
+    """What is shown of a training by a process that only shares its work: single lines."""
+
+    def say(self, text: str) -> None:
+        """Prints a line."""
+        print(text, flush=True)
+
+    def compiling(self, call: Call, what: str) -> None:
+        """Announces that a call's program is being compiled."""
+        self.say(f"{call.stage.name}, {call.lesson.name}: compiling {what}")
+
+    def update(self, call: Call, steps: int, figures: dict[str, float]) -> None:
+        """Shows nothing."""
+
+    def finished(self, call: Call) -> None:
+        """Shows nothing."""

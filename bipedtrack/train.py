@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import os
 import pathlib
 import signal
 import sys
-from typing import Any, Literal
+import traceback
+from typing import Any, Literal, NoReturn
 
 import tyro
 
-from bipedtrack import checkpoint, compilation, config, curriculum, robot, versions
+from bipedtrack import checkpoint, compilation, config, curriculum, distributed, robot, versions
+from bipedtrack.curriculum import Curriculum
+from bipedtrack.distributed import ALONE, Process
 from bipedtrack.messages import fail, quiet_imports
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
@@ -36,6 +40,14 @@ class Train:
     """Where to train; never falls back silently. auto: the best that JAX finds."""
     devices: int = 0
     """How many local devices share the robots. 0: all accelerators, or on the CPU one for each core that has work enough."""
+    distributed: bool = False
+    """Trains together with the other processes of this job of SLURM, Kubernetes or Open MPI."""
+    coordinator: str = ""
+    """HOST:PORT where the first of several processes listens; every one of them is told the same."""
+    processes: int = 1
+    """How many processes train together."""
+    process: int = 0
+    """Which of them this one is, from 0; the first one alone reads and writes the run directory."""
 
 
 def main() -> None:
@@ -43,24 +55,62 @@ def main() -> None:
     options = tyro.cli(Train, prog="python -m bipedtrack.train")
     try:
         versions.require()
-        run(options)
-    except (
-        versions.VersionError,
-        config.ConfigError,
-        robot.RobotError,
-        checkpoint.RunError,
-        checkpoint.CheckpointError,
-        DeviceError,
-    ) as error:
+        process = distributed.join(options.coordinator, options.processes, options.process, options.distributed)
+    except (versions.VersionError, distributed.DistributedError) as error:
         fail(str(error))
+    if process.count == 1:
+        _run_or_fail(options, process)
+    else:
+        _run_among_others(options, process)
+
+
+def _run_or_fail(options: Train, process: Process) -> None:
+    """Trains, or says in one line on stderr what was wrong and exits with status 2."""
+    try:
+        run(options, process)
+    except REFUSALS as error:
+        fail(str(error))
+
+
+def _run_among_others(options: Train, process: Process) -> NoReturn:
+    """Trains and leaves without the goodbyes of `jax.distributed`, which would wait for processes that wait or are lost."""
+    from jax.errors import JaxRuntimeError
+
+    try:
+        _run_or_fail(options, process)
+        status = 0
+    except SystemExit as left:
+        status = left.code if isinstance(left.code, int) else 1
+    except JaxRuntimeError as error:
+        reason = (str(error) or "no reason given").splitlines()[0]
+        print(
+            f"bipedtrack: {process}: the training cannot go on without the others ({reason}); what is saved goes on with "
+            "--resume in all processes",
+            file=sys.stderr,
+        )
+        status = 1
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    distributed.leave(status)
 
 
 class DeviceError(RuntimeError):
     """The wanted device is not there; the message is one line."""
 
 
-def use_devices(device: str, count: int, ppo: curriculum.PpoConfig) -> tuple[int, str]:
-    """Makes JAX use devices; returns how many share the robots, and their description.
+REFUSALS = (
+    config.ConfigError,
+    robot.RobotError,
+    checkpoint.RunError,
+    checkpoint.CheckpointError,
+    distributed.DistributedError,
+    DeviceError,
+)
+
+
+def use_devices(device: str, count: int, ppo: curriculum.PpoConfig, process: Process = ALONE) -> tuple[int, str]:
+    """Makes JAX use local devices; returns how many of each process share the robots, and their description.
 
     device: cpu, gpu or auto; count: as `Train.devices`. A CPU counts as one device for each of its cores that gets a few
     hundred robots: XLA runs much of a step on one thread, so that two devices on two cores are faster than one on both.
@@ -71,7 +121,7 @@ def use_devices(device: str, count: int, ppo: curriculum.PpoConfig) -> tuple[int
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.CRITICAL)
     if device != "auto":
         jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    jax.config.update("jax_num_cpu_devices", count or _cores_with_work(ppo))
+    jax.config.update("jax_num_cpu_devices", count or _cores_with_work(ppo, process.count))
     try:
         found = jax.local_devices()
     except (RuntimeError, AssertionError) as error:  # an assertion where JAX has no build for the platform at all
@@ -83,51 +133,99 @@ def use_devices(device: str, count: int, ppo: curriculum.PpoConfig) -> tuple[int
     count = count or len(found)
     if count > len(found):
         raise DeviceError(f"--devices {count}: there are {len(found)} of kind {found[0].device_kind}")
-    if not ppo.shares_out(count):
+    if not ppo.shares_out(count * process.count):
+        processes = f" of {process.count} processes" if process.count > 1 else ""
         raise config.ConfigError(
-            f"--devices {count}: num_envs ({ppo.num_envs}) must be a multiple of the devices times num_minibatches "
-            f"({ppo.num_minibatches})"
+            f"--devices {count}{processes}: num_envs ({ppo.num_envs}) must be a multiple of all devices times "
+            f"num_minibatches ({ppo.num_minibatches})"
         )
-    return count, f"{count} x {found[0].device_kind}"
+    processes = f" in each of {process.count} processes" if process.count > 1 else ""
+    return count, f"{count} x {found[0].device_kind}{processes}"
 
 
-def _cores_with_work(ppo: curriculum.PpoConfig) -> int:
+def _cores_with_work(ppo: curriculum.PpoConfig, processes: int) -> int:
     """The greatest number of cores that share the robots evenly with at least _ROBOTS_A_CORE each; at least 1."""
-    most = min(len(os.sched_getaffinity(0)), ppo.num_envs // _ROBOTS_A_CORE)
-    return next((count for count in range(most, 1, -1) if ppo.shares_out(count)), 1)
+    most = min(len(os.sched_getaffinity(0)), ppo.num_envs // processes // _ROBOTS_A_CORE)
+    return next((count for count in range(most, 1, -1) if ppo.shares_out(count * processes)), 1)
 
 
-def run(options: Train) -> None:
-    """Trains, exports and shows the table."""
+def run(options: Train, process: Process) -> None:
+    """Trains, exports and shows the table; or trains along, where the process is not the first one."""
+    if process.count == 1:  # JAX keeps the first process's programs alone; the others would compile while it waits in vain
+        compilation.use_cache()
+    job = Job(**distributed.from_first("job", lambda: dataclasses.asdict(_job(options)), process))
+    plan = job.plan
+    devices, description = use_devices(options.device, job.devices, plan.ppo, process)
+    job = dataclasses.replace(job, devices=devices)
+    with contextlib.ExitStack() as stack:
+        opened: list[checkpoint.RunDirectory] = []
+
+        def open_directory() -> None:
+            opened.append(_directory(options, job, process))
+            stack.callback(opened[0].close)
+
+        distributed.from_first("run directory", open_directory, process)
+        if process.first:
+            _train(opened[0], job, description, process)
+        else:
+            _train_along(job, process)
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What all processes need to know of a training."""
+
+    curriculum: dict[str, Any]
+    seed: int
+    devices: int  # of each process
+
+    @property
+    def plan(self) -> Curriculum:
+        """The curriculum."""
+        return config.from_dict(Curriculum, self.curriculum, "the first process")
+
+
+def _job(options: Train) -> Job:
+    """The training to begin or to go on with, with as many devices as are wished for."""
     if options.seed < 0:
         raise config.ConfigError(f"--seed {options.seed}: must not be negative")
-    compilation.use_cache()
     if options.devices < 0:
         raise config.ConfigError(f"--devices {options.devices}: must not be negative")
-    folder = options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
     if options.resume:
-        directory = checkpoint.RunDirectory.open(folder)
-        plan, seed, devices = curriculum.of_run(directory)
-        devices, description = use_devices(options.device, options.devices or devices, plan.ppo)
-    else:
-        plan, seed = curriculum.load(options.curriculum), options.seed
-        plan.substeps(robot.load(plan.robot).timestep)
-        devices, description = use_devices(options.device, options.devices, plan.ppo)
-        settings = {"curriculum": config.to_dict(plan), "seed": seed, "devices": devices, "versions": _versions()}
-        directory = checkpoint.RunDirectory.create(folder, settings)
-    try:
-        _train(directory, plan, seed, devices, description)
-    finally:
-        directory.close()
+        with contextlib.closing(checkpoint.RunDirectory.open(_folder(options))) as directory:
+            plan, seed, devices = curriculum.of_run(directory)
+        return Job(config.to_dict(plan), seed, options.devices or devices)
+    plan = curriculum.load(options.curriculum)
+    plan.substeps(robot.load(plan.robot).timestep)
+    return Job(config.to_dict(plan), options.seed, options.devices)
+
+
+def _folder(options: Train) -> pathlib.Path:
+    return options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
+
+
+def _directory(options: Train, job: Job, process: Process) -> checkpoint.RunDirectory:
+    """The run directory, created where the run is a new one."""
+    if options.resume:
+        return checkpoint.RunDirectory.open(_folder(options))
+    settings = dataclasses.asdict(job) | {"processes": process.count, "versions": _versions()}
+    return checkpoint.RunDirectory.create(_folder(options), settings)
+
+
+def _train_along(job: Job, process: Process) -> None:
+    """Trains as one of several processes, without a run directory."""
+    with quiet_imports():
+        from bipedtrack import training
+    from bipedtrack.progress import Aside
+
+    training.train(job.plan, None, job.seed, job.devices, Aside(), lambda: False, process)
 
 
 def _versions() -> dict[str, str | None]:
     return {row.name: row.found for row in versions.check()}
 
 
-def _train(
-    directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, seed: int, devices: int, description: str
-) -> None:
+def _train(directory: checkpoint.RunDirectory, job: Job, description: str, process: Process) -> None:
     import rich.console
 
     with quiet_imports():
@@ -135,6 +233,7 @@ def _train(
     from bipedtrack.progress import Progress
 
     stop = _stop_on_signals()
+    plan, seed = job.plan, job.seed
     calls = curriculum.calls(plan)
     found = directory.latest()
     finished = 0 if found is None else found[0] + 1
@@ -147,7 +246,7 @@ def _train(
             + (f"; {finished} calls are done" if finished else "")
         )
         try:
-            params = training.train(plan, directory, seed, devices, progress, stop)
+            params = training.train(plan, directory, seed, job.devices, progress, stop, process)
         except training.Stopped:
             saved = directory.latest()
             progress.say(

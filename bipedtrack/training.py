@@ -21,9 +21,10 @@ from brax.training.agents.ppo import losses, networks
 from brax.training.agents.ppo import train as ppo
 from flax import linen
 
-from bipedtrack import __version__, autoreset, curriculum, env, observation, policy, robot, tasks, versions
+from bipedtrack import __version__, autoreset, curriculum, distributed, env, observation, policy, robot, tasks, versions
 from bipedtrack.checkpoint import CheckpointError, RunDirectory
-from bipedtrack.progress import Progress
+from bipedtrack.distributed import ALONE, Process
+from bipedtrack.progress import Aside, Progress
 
 _UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
 _ACTIVATIONS = {"swish": linen.swish, "tanh": linen.tanh, "relu": linen.relu}
@@ -54,23 +55,36 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: cur
 
 def train(
     config: curriculum.Curriculum,
-    run: RunDirectory,
+    run: RunDirectory | None,
     seed: int,
     devices: int,
-    progress: Progress,
+    progress: Progress | Aside,
     wants_to_stop: Callable[[], bool],
+    process: Process = ALONE,
 ) -> Params:
     """Runs the calls that are not yet finished, saving after each, and returns the last parameters.
 
-    Raises Stopped within a few updates after `wants_to_stop` turned true, and RunError when a checkpoint cannot be written.
+    Where several processes train together the first one alone has a run directory, and all begin with its checkpoint.
+    Raises Stopped within a few updates after `wants_to_stop` turned true, RunError when a checkpoint cannot be written, and
+    DistributedError where the processes do not agree.
     """
-    found = run.latest()
+    found = run.latest() if run else None
     params = None if found is None else from_arrays(config, found[1])
-    for call in curriculum.calls(config)[0 if found is None else found[0] + 1 :]:
+    finished = distributed.from_first("finished calls", lambda: 0 if found is None else found[0] + 1, process)
+    if finished:
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), _template(config))
+        params = distributed.share_arrays(blank if params is None else params, process)
+    for call in curriculum.calls(config)[finished:]:
         params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
-        run.save_checkpoint(call.index, to_arrays(params), {"seed": seed})
+        arrays = to_arrays(params)
+        if process.count > 1:
+            distributed.require_agreement(arrays, process)
+            progress.say(f"{process}, call {call.index + 1}: parameters {distributed.digest(arrays)}")
+        if run:
+            run.save_checkpoint(call.index, arrays, {"seed": seed})
         progress.finished(call)
         jax.clear_caches()  # a call's programs serve no other call, and each holds hundreds of megabytes
+    distributed.part(process)
     return params
 
 
@@ -80,7 +94,7 @@ def _run_call(
     seed: int,
     devices: int,
     params: Params | None,
-    progress: Progress,
+    progress: Progress | Aside,
     wants_to_stop: Callable[[], bool],
 ) -> Params:
     """One `ppo.train` from the given parameters. Steps are rounded up to whole epochs of whole updates."""
@@ -167,19 +181,36 @@ def adapted_brax() -> Iterator[None]:
       later ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares, and the epoch
       would compile twice.
     - Brax reports episodes by a callback into Python, and a program with one cannot be kept. Here the loss reports them.
+    - Where several processes train, what `jax.pmap` returns clings to the others' devices, and brax's mean of it fails.
     """
-    original = jax.device_put_replicated, losses.compute_ppo_loss
+    original = jax.device_put_replicated, losses.compute_ppo_loss, jax.pmap
     jax.device_put_replicated, losses.compute_ppo_loss = _replicate, _loss_and_episodes(losses.compute_ppo_loss)
+    if jax.process_count() > 1:
+        jax.pmap = _local(jax.pmap)
     try:
         yield
     finally:
-        jax.device_put_replicated, losses.compute_ppo_loss = original
+        jax.device_put_replicated, losses.compute_ppo_loss, jax.pmap = original
 
 
 def _replicate(x: Any, devices: Sequence[Any]) -> Any:
     axis = ppo._PMAP_AXIS_NAME
     sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), (axis,)), jax.sharding.PartitionSpec(axis))
     return jax.tree.map(lambda leaf: jax.device_put(jax.numpy.stack([leaf] * len(devices)), sharding), x)
+
+
+def _local(pmap: Callable[..., Any]) -> Callable[..., Any]:
+    """`jax.pmap` whose outputs hold nothing but this process's part."""
+
+    def own(array: jax.Array) -> jax.Array:
+        parts = [shard.data for shard in array.addressable_shards]
+        return jax.make_array_from_single_device_arrays(array.shape, array.sharding, parts)
+
+    def mapped(*args: Any, **kwargs: Any) -> Callable[..., Any]:
+        function = pmap(*args, **kwargs)
+        return lambda *inputs: jax.tree.map(own, function(*inputs))
+
+    return mapped
 
 
 def _loss_and_episodes(compute_loss: Callable[..., Any]) -> Callable[..., Any]:
