@@ -15,7 +15,7 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 # A module may import those before it: on a line above, or further left on its own.
 LADDER = """
     versions paths messages record drawing
-    compilation
+    compilation distributed
     config checkpoint
     rotations robot
     nodes kinematics trace packets

@@ -26,6 +26,7 @@ ENVIRONMENT = os.environ | {
     "XLA_FLAGS": "--xla_backend_optimization_level=0",
     "COLUMNS": "200",
 }
+ENVIRONMENT.pop("TF_CPP_MIN_LOG_LEVEL", None)  # jax has set it here
 PATIENCE = 600  # s that anything may take on a busy machine
 
 
