@@ -31,7 +31,7 @@ train: setup
 
 # Films the policy that ships; needs no screen (EGL or OSMesa).
 demo: setup
-	$(BIN)/python -m bipedtrack.video models/policies/first.npz --script curricula/footsteps/walk.csv --out demo.mp4
+	$(BIN)/python -m bipedtrack.video models/policies/best.npz --script curricula/footsteps/walk.csv --out demo.mp4
 
 format: setup
 	$(BIN)/ruff format .

@@ -34,7 +34,7 @@ class Rollout:
     """Numbers of robots."""
     steps: int = 200
     """Physics steps of each robot that are timed at once."""
-    policy: str = "models/policies/first.npz"
+    policy: str = "models/policies/best.npz"
     """The policy that acts, so that the robots do what they usually do."""
     stairs: bool = True
     """Also on stairs, which cost three boxes."""

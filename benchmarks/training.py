@@ -30,7 +30,7 @@ class Training:
     """Of the curriculum; 0 is level ground."""
     updates: int = 8
     """That are timed at once."""
-    policy: str = "models/policies/first.npz"
+    policy: str = "models/policies/best.npz"
     """The policy that acts where the environment is measured without learning."""
     peer: bool = True
     """Also brax's humanoid."""

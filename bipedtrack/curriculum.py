@@ -130,7 +130,6 @@ class Curriculum:
     policy_period: float = 0.02  # s, for which a feedback is held
     episode_seconds: float = 10.0
     evaluation_episodes: int = 48  # for each line of the table at the end of a training; 0: no table
-    balanced_steps: bool = False  # stepping targets put the centre of mass, not the trunk, over the feet's middle
     ranges: Ranges = Ranges()
     rewards: RewardConfig = RewardConfig()
     control: ControlConfig = ControlConfig()

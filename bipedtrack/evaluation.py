@@ -73,9 +73,7 @@ def _only(
     hold_after: tuple[int, int],
 ) -> tasks.Distribution:
     chosen = tasks.Shares(**(dict.fromkeys(tasks.KINDS, 0.0) | shares))
-    return tasks.distribution(
-        config.ranges, chosen, difficulty, hold_share, hold_after, balance=float(config.balanced_steps)
-    )
+    return tasks.distribution(config.ranges, chosen, difficulty, hold_share, hold_after)
 
 
 def level_ground(rows: list[Row]) -> Row:

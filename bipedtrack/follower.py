@@ -8,16 +8,16 @@ How streamed targets become the command of eq (3):
   axis. No node is ever faster than `packets.FASTEST`; what cannot be reached in time is reached later.
 - **dI^t/dt** is the derivative of just that motion: zero once the target is reached.
 - **I^s and T** are the packet's end and timer, the timer running down. Without them they are guessed: the step ends with the
-  nodes where the packet wants them but a lifted foot straight down on the ground under it, in 0.3 s, or sooner if it comes
-  down fast enough.
+  nodes where the packet wants them but a lifted foot straight down on the ground under it, 0.55 s after it was lifted, or
+  sooner if it comes down fast enough.
 - When the next packet is late, I^t stays at the last one's target; or, if that gave an end and a timer that still runs, it
   goes on to that end as one task step of the planner.
 - After `hold` seconds without a packet that can be followed, and not before such a step has ended, the command is a task
   step to standing: both feet down on the ground under them, the trunk upright between them at standing height. Then the
   robot stands until there are packets again.
 
-Targets out of a leg's reach move to `kinematics.project`'s answer; where both legs are too short or too long for the trunk's
-height, the trunk moves instead of the feet.
+Targets out of a leg's reach move to `kinematics.project`'s answer; where that moves both feet the same way, the trunk moves
+instead.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _LONGEST_INTERVAL = 0.5  # s between packets that targets are stretched over
 _FARTHEST_JUMP = NodeRates(0.3, 0.6, 0.4, 0.8)  # m, rad, m, rad from where the targets are
 _FARTHEST_PROJECTION = 0.1  # m that an ankle may be out of reach
 _LIFTED = 0.005  # m above the ground: a foot that is higher is in the air
-_LANDING = 0.3  # s that a lifted foot takes to land, as far as is known
+_SWING = 0.55  # s from lifting a foot to its landing, as far as is known
+_SHORTEST_SWING = 0.05  # s that a foot in the air has still to go, at the least
 _CALM = NodeRates(0.25, 0.6, 0.3, 0.8)  # m/s, rad/s, m/s, rad/s on the way to standing
 _SHORTEST_WAY = 0.4  # s
 _RISE = 0.3  # m/s: a step that ends without packets bends up by so much times the time that is left to it
@@ -70,6 +71,7 @@ class Follower:
         self._followed: _Followed | None = None
         self._step: TaskStep | None = self._to_standing()  # without packets
         self._age = self._time = 0  # control steps since the last packet that was followed, and into the step
+        self._lifted = np.zeros(2)  # s since each foot left the ground
 
     @property
     def target(self) -> Nodes:
@@ -108,13 +110,15 @@ class Follower:
         """The command of this control step; the next call gives the next one's."""
         timestep, now = self.robot.timestep, self._target
         self._choose_step()
+        height = now.ankle_positions[:, 2] - self._footing(now)
+        self._lifted = np.where(height > _LIFTED, self._lifted + timestep, 0.0)
         if self._step is not None:
             self._time += 1
             end, goal, _, timer = planner.command(self._step, np.float64(self._time * timestep))
             seconds = timestep
         elif self._followed is not None:
             goal, seconds = self._followed.goal, max(self._followed.due - self._age, 1) * timestep
-            end, timer = self._end_and_timer(self._followed)
+            end, timer = self._end_and_timer(self._followed, height)
         rates = _rates_towards(now, goal, seconds)
         self._target = _moved(now, rates, timestep)
         self._age += 1
@@ -139,17 +143,17 @@ class Follower:
             if remaining.max() > 0:
                 self._step, self._time = self._to_end(packet.end, remaining), 0
 
-    def _end_and_timer(self, followed: _Followed) -> tuple[Nodes, np.ndarray]:
-        """I^s and T of the packet that is followed; what it does not say is guessed."""
+    def _end_and_timer(self, followed: _Followed, height: np.ndarray) -> tuple[Nodes, np.ndarray]:
+        """I^s and T of the packet that is followed; what it does not say is guessed. height: (2,) m, of the feet."""
         packet, now = followed.packet, self._target
         if packet.end is not None and packet.timer is not None:
             return packet.end, np.maximum(packet.timer - self._age * self.robot.timestep, 0.0)
         down = followed.goal.ankle_positions.copy()
         down[:, 2] = self._footing(followed.goal)
-        height = now.ankle_positions[:, 2] - self._footing(now)
         falling = np.maximum((now.ankle_positions - followed.goal.ankle_positions)[:, 2], 1e-4)
         ticks = max(followed.due - self._age, 1)
-        landing = np.minimum(_LANDING, height / falling * ticks * self.robot.timestep)
+        swing = np.maximum(_SWING - self._lifted, _SHORTEST_SWING)
+        landing = np.minimum(swing, height / falling * ticks * self.robot.timestep)
         return followed.goal._replace(ankle_positions=down), np.where(height > _LIFTED, landing, 0.0)
 
     def _footing(self, nodes: Nodes) -> np.ndarray:
@@ -170,13 +174,13 @@ class Follower:
         wanted, wanted_yaws = ankles_in_trunk_frame(nodes)
         nearest, yaws = kinematics.project(self.robot, wanted, wanted_yaws)
         shift = (nearest - wanted) @ to_w.T
-        # what moves both feet up or down is the trunk's to move
-        common = np.clip(0.0, shift[:, 2].min(), shift[:, 2].max())
-        shift[:, 2] -= common
+        # what moves both feet alike is the trunk's to move
+        common = np.clip(0.0, shift.min(axis=0), shift.max(axis=0))
+        shift = shift - common
         if np.linalg.norm(shift, axis=-1).max() > most:
             raise Refused("reach", f"an ankle is more than {most:g} m out of reach")
         nodes = Nodes(
-            trunk_position=nodes.trunk_position - np.array([0.0, 0.0, common]),
+            trunk_position=nodes.trunk_position - common,
             trunk_orientation=nodes.trunk_orientation,
             ankle_positions=nodes.ankle_positions + shift,
             ankle_yaws=nodes.ankle_yaws + rotations.wrap(yaws - wanted_yaws),
@@ -201,7 +205,8 @@ class Follower:
         ankles[:, 2] = self._footing(start)
         yaw = start.ankle_yaws[0] + rotations.wrap(start.ankle_yaws[1] - start.ankle_yaws[0]) / 2
         trunk = ankles.mean(axis=0) + np.array([0.0, 0.0, footsteps.TRUNK_HEIGHT - self.robot.ankle_height])
-        end = self._reachable(Nodes(trunk, rotations.from_yaw(yaw), ankles, start.ankle_yaws), math.inf)
+        upright = footsteps.balanced(self.robot, Nodes(trunk, rotations.from_yaw(yaw), ankles, start.ankle_yaws), trunk[:2])
+        end = self._reachable(upright, math.inf)
         way = _rates_towards(start, end, 1.0, limited=False)
         seconds = max(_SHORTEST_WAY, *(float(speed(part).max() / calm) for part, calm in zip(way, _CALM, strict=True)))
         lifted = start.ankle_positions[:, 2] - ankles[:, 2] > _LIFTED

@@ -13,7 +13,7 @@ defaults. What the cells mean and what empty ones do:
     z                        of the same point; empty: the top of the highest box at (x, y), else 0
     period                   empty: 0.55 s; rounded to a multiple of the control period
     lift                     above the higher end of the swing; 0 slides the foot straight; empty: 0.08 m
-    trunk_x, trunk_y         at the end of the step; empty: midway between the feet
+    trunk_x, trunk_y         at the end of the step; empty: the centre of mass is midway between the feet
     trunk_z                  absolute, as all; empty: 0.75 m above the mean height of the two footholds
     trunk_roll, trunk_pitch  orientation is Rz(yaw) Ry(pitch) Rx(roll); empty: 0, level
     trunk_yaw                empty: the mean of the feet's yaws
@@ -177,13 +177,14 @@ def parse(text: str, robot: Robot, name: str) -> Script:
 
 
 def initial_nodes(robot: Robot) -> Nodes:
-    """Where every script starts: feet side by side on the ground, facing x, the trunk over them; float64."""
-    return Nodes(
+    """Where every script starts: feet side by side on the ground, facing x, the centre of mass between them; float64."""
+    upright = Nodes(
         trunk_position=np.array([0.0, 0.0, TRUNK_HEIGHT]),
         trunk_orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         ankle_positions=np.array([[0.0, y, robot.ankle_height] for y in FEET_Y]),
         ankle_yaws=np.zeros(2),
     )
+    return balanced(robot, upright, np.zeros(2))
 
 
 def initial_qpos(robot: Robot) -> np.ndarray:
@@ -369,16 +370,23 @@ def task_step(
 
 
 def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: Mapping[str, float]) -> Nodes:
-    """Nodes with the trunk where `values` say, or else over the feet."""
+    """Nodes with the trunk where `values` say, or else with the centre of mass over the feet's middle."""
     given = values.get
     x, y, z = ankles.mean(axis=0)
-    z += TRUNK_HEIGHT - robot.ankle_height
+    z = given("trunk_z", z + TRUNK_HEIGHT - robot.ankle_height)
     angles = given("trunk_roll", 0.0), given("trunk_pitch", 0.0), given("trunk_yaw", yaws.mean())
     orientation = rotations.from_euler(*angles)
     if orientation @ start.trunk_orientation < 0:  # of the two quaternions the one that goes on from the last
         orientation = -orientation
-    position = np.array([given("trunk_x", x), given("trunk_y", y), given("trunk_z", z)])
-    return Nodes(position, orientation, ankles, yaws)
+    x, y = balanced(robot, Nodes(np.array([x, y, z]), orientation, ankles, yaws), np.array([x, y])).trunk_position[:2]
+    return Nodes(np.array([given("trunk_x", x), given("trunk_y", y), z]), orientation, ankles, yaws)
+
+
+def balanced(robot: Robot, nodes: Nodes, centre: np.ndarray) -> Nodes:
+    """The nodes with the trunk moved level until the centre of mass stands over `centre`, (2,) m."""
+    for _ in range(3):
+        nodes = kinematics.balanced(robot, nodes, centre)
+    return nodes
 
 
 def problems_of(robot: Robot, boxes: Sequence[Box], step: TaskStep) -> list[str]:

@@ -108,6 +108,12 @@ def centre_of_mass(robot: Robot, joints: Array) -> Array:
     return legs.sum(axis=0) / (trunk_mass + 2 * sum(masses))
 
 
+def centre_of_mass_at(robot: Robot, nodes: Nodes) -> Array:
+    """The centre of mass of a robot on its nodes, or as near as it can reach, (3,) m in the world frame."""
+    joints = inverse(robot, *project(robot, *ankles_in_trunk_frame(nodes)))
+    return nodes.trunk_position + centre_of_mass(robot, joints) @ rotations.to_matrix(nodes.trunk_orientation).T
+
+
 def balanced(robot: Robot, nodes: Nodes, centre: Array) -> Nodes:
     """The nodes with the trunk moved level so that the robot's centre of mass stands nearer to `centre`, (2,) m.
 
@@ -115,9 +121,7 @@ def balanced(robot: Robot, nodes: Nodes, centre: Array) -> Nodes:
     percent of the distance.
     """
     xp = namespace(centre)
-    joints = inverse(robot, *project(robot, *ankles_in_trunk_frame(nodes)))
-    to_w = rotations.to_matrix(nodes.trunk_orientation).T
-    mass = nodes.trunk_position + centre_of_mass(robot, joints) @ to_w
+    mass = centre_of_mass_at(robot, nodes)
     move = xp.concat([1.3 * (centre - mass[:2]), xp.zeros_like(centre[:1])])
     return nodes._replace(trunk_position=nodes.trunk_position + move)
 

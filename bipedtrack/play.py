@@ -47,7 +47,7 @@ class Play:
 def shipped() -> dict[str, pathlib.Path]:
     """The policies that come with the package, by name, `first` first."""
     found = {path.stem: path for path in sorted((paths.data_dir("models") / "policies").glob("*.npz"))}
-    return {name: found[name] for name in sorted(found, key=lambda name: (name != "first", name))}
+    return {name: found[name] for name in sorted(found, key=lambda name: (name != "best", name))}
 
 
 def choice(given: pathlib.Path | None) -> dict[str, pathlib.Path]:

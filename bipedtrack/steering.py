@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bipedtrack import footsteps, rotations
+from bipedtrack import footsteps, kinematics, rotations
 from bipedtrack.footsteps import Box
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
@@ -43,7 +43,7 @@ class Steering(NamedTuple):
     turn_angle: float = 0.2  # rad per task step
     period: float = footsteps.PERIOD  # s
     lift: float = footsteps.LIFT  # m
-    trunk_ahead: float = 0.0  # m from midway between the feet, towards their mean heading
+    trunk_ahead: float = 0.0  # m, the centre of mass from midway between the feet, towards their mean heading
     trunk_aside: float = 0.0  # m, to the left
     trunk_height: float = footsteps.TRUNK_HEIGHT  # m above the mean of the footholds
     trunk_roll: float = 0.0  # rad
@@ -313,11 +313,15 @@ def _turned(yaw: float, vector: np.ndarray) -> np.ndarray:
 def _trunk(robot: Robot, ankles: np.ndarray, yaws: np.ndarray, asked: Steering) -> dict[str, float]:
     """The trunk's cells of a script's line that ends with ankles (2, 3), m, and yaws (2,), rad."""
     yaw = float(yaws.mean())
-    x, y = ankles[:, :2].mean(axis=0) + _turned(yaw, np.array([asked.trunk_ahead, asked.trunk_aside]))
+    centre = ankles[:, :2].mean(axis=0) + _turned(yaw, np.array([asked.trunk_ahead, asked.trunk_aside]))
+    height = float(ankles[:, 2].mean()) - robot.ankle_height + asked.trunk_height
+    orientation = rotations.from_euler(asked.trunk_roll, asked.trunk_pitch, yaw + asked.trunk_yaw)
+    posture = Nodes(np.array([*centre, height]), orientation, ankles, yaws)
+    x, y = footsteps.balanced(robot, posture, centre).trunk_position[:2]
     return {
         "trunk_x": float(x),
         "trunk_y": float(y),
-        "trunk_z": float(ankles[:, 2].mean()) - robot.ankle_height + asked.trunk_height,
+        "trunk_z": height,
         "trunk_roll": asked.trunk_roll,
         "trunk_pitch": asked.trunk_pitch,
         "trunk_yaw": yaw + asked.trunk_yaw,
@@ -355,13 +359,14 @@ def trunk_at(robot: Robot, start: Nodes, position: np.ndarray, orientation: np.n
     """The wishes with the trunk at a place in the world: position (3,) m and quaternion (4,)."""
     yaw = float(start.ankle_yaws.mean())
     middle = start.ankle_positions.mean(axis=0) - np.array([0.0, 0.0, robot.ankle_height])
-    apart = np.asarray(position, float) - middle
-    ahead, aside = _turned(-yaw, apart[:2])
-    roll, pitch, turned = rotations.to_euler(np.asarray(orientation, float))
+    position, orientation = np.asarray(position, float), np.asarray(orientation, float)
+    posture = start._replace(trunk_position=position, trunk_orientation=orientation)
+    ahead, aside = _turned(-yaw, (kinematics.centre_of_mass_at(robot, posture) - middle)[:2])
+    roll, pitch, turned = rotations.to_euler(orientation)
     return asked._replace(
         trunk_ahead=float(ahead),
         trunk_aside=float(aside),
-        trunk_height=float(apart[2]),
+        trunk_height=float(position[2] - middle[2]),
         trunk_roll=float(roll),
         trunk_pitch=float(pitch),
         trunk_yaw=float(rotations.wrap(turned - yaw)),

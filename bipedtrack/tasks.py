@@ -97,7 +97,6 @@ class Distribution(NamedTuple):
     down_share: Array  # () share of the stairs that go down
     mix_share: Array  # () share of the episodes on level ground that change their kind every MIX_STEPS task steps
     push_share: Array  # () share of the episodes with pushes
-    balance: Array  # () while stepping, 0: the trunk over the feet's middle, 1: the centre of mass
     ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
 
 
@@ -132,7 +131,6 @@ def distribution(
     down_share: float = 0.5,
     mix_share: float = 0.0,
     push_share: float = 0.0,
-    balance: float = 0.0,
 ) -> Distribution:
     """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
     total = jnp.array(shares, jnp.float32)
@@ -148,7 +146,6 @@ def distribution(
         down_share=jnp.float32(down_share),
         mix_share=jnp.float32(mix_share),
         push_share=jnp.float32(push_share),
-        balance=jnp.float32(balance),
         ranges=scaled,
     )
 
@@ -184,8 +181,8 @@ def _upright(height: Array) -> _Posture:
     return _Posture(jnp.zeros(2), height, zero, zero, zero)
 
 
-def _over_feet(posture: _Posture, ankles: Array, yaws: Array, robot: Robot, balance: Array) -> Nodes:
-    """Nodes with the trunk held over ankles (2, 3), m, with yaws (2,); at balance 1 its centre of mass is meant instead."""
+def _over_feet(posture: _Posture, ankles: Array, yaws: Array, robot: Robot) -> Nodes:
+    """Nodes with the trunk held so over ankles (2, 3), m, with yaws (2,), that its centre of mass stands where it should."""
     yaw = yaws.mean()
     middle = ankles.mean(axis=0)
     c, s = jnp.cos(yaw), jnp.sin(yaw)
@@ -193,9 +190,7 @@ def _over_feet(posture: _Posture, ankles: Array, yaws: Array, robot: Robot, bala
     height = middle[2:] + posture.height - robot.ankle_height
     orientation = rotations.from_euler(posture.roll, posture.pitch, yaw + posture.yaw)
     nodes = Nodes(jnp.concatenate([centre, height]), orientation, ankles, yaws)
-    steady = jax.lax.fori_loop(0, 3, lambda _, nodes: kinematics.balanced(robot, nodes, centre), nodes)
-    way = steady.trunk_position - nodes.trunk_position
-    return nodes._replace(trunk_position=nodes.trunk_position + balance * way)
+    return jax.lax.fori_loop(0, 3, lambda _, nodes: kinematics.balanced(robot, nodes, centre), nodes)
 
 
 _POSTURE = ("posture_x", "posture_y", "posture_height", "posture_roll", "posture_pitch", "posture_yaw")
@@ -259,7 +254,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
     yaws = jnp.where(still, draw["foot_yaw"] * 2 * side, jnp.zeros(2))
     posture = _drawn_posture(_draw(key_posture, _POSTURE, given.ranges))
     posture = jax.tree.map(functools.partial(jnp.where, still), posture, _upright(motion.trunk_height))
-    return task, _over_feet(posture, ankles, yaws, robot, jnp.where(still, 1.0, given.balance))
+    return task, _over_feet(posture, ankles, yaws, robot)
 
 
 def _present(given: Distribution, task: Task, index: Array) -> Motion:
@@ -317,7 +312,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     period = jnp.where(squats, draw["squat_period"], period)
     posture = jax.tree.map(functools.partial(jnp.where, squats), _drawn_posture(draw), _upright(motion.trunk_height))
     moves = functools.partial(jnp.where, squats | steps)
-    end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot, jnp.where(squats, 1.0, given.balance)), start)
+    end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
     swing = jnp.where(steps, (jnp.arange(2) == (index + motion.first) % 2).astype(jnp.float32), 0.0)
     lift = swing * motion.lift * vary[1]
     u = jax.random.uniform(key_curve, (2, 3))

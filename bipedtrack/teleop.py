@@ -237,7 +237,7 @@ def main() -> None:
             raise ValueError(f"--record {options.record}: there is no such folder")
         the_robot = robot.load()
         script = footsteps.load(options.ground, the_robot) if options.ground else LEVEL_GROUND
-        file = options.policy or paths.data_dir("models") / "policies" / "first.npz"
+        file = options.policy or paths.data_dir("models") / "policies" / "best.npz"
         controller = policy.Controller.load(file, the_robot)
         rows: list[list[Any]] | None = [] if options.record else None
         with listen(options.host, options.port) as source:

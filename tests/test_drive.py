@@ -3,20 +3,22 @@
 import math
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 
 from bipedtrack import drive as drives
-from bipedtrack import env, footsteps, nodes, paths, policy, rotations, scripts, steering, tasks
+from bipedtrack import env, footsteps, kinematics, nodes, paths, policy, rotations, scripts, steering, tasks
 from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
 from bipedtrack.footsteps import Box
+from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.steering import Foothold, Steering
 
 
 @pytest.fixture(scope="module")
 def shipped(robot: robots.Robot) -> policy.Policy:
-    return policy.load(paths.data_dir("models") / "policies" / "first.npz", robot)
+    return policy.load(paths.data_dir("models") / "policies" / "best.npz", robot)
 
 
 @pytest.fixture
@@ -38,11 +40,22 @@ def ground(robot: robots.Robot, name: str) -> tuple[Box, ...]:
 # Steering: footholds worked by hand. Feet begin at (0, ±0.1), the ankles 0.04 m above their soles.
 
 
+def centre_of_mass(robot: robots.Robot, nodes: Nodes) -> np.ndarray:
+    """MuJoCo's centre of mass, (2,) m, of the robot on its nodes."""
+    data = mujoco.MjData(robots.build_model(robot.name))
+    joints = kinematics.inverse(robot, *ankles_in_trunk_frame(nodes))
+    data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, joints])
+    mujoco.mj_kinematics(data.model, data)
+    mujoco.mj_comPos(data.model, data)
+    return data.subtree_com[0][:2].copy()
+
+
 def test_walking_puts_the_foot_one_step_ahead_of_the_other(robot: robots.Robot) -> None:
     asked = Steering(ahead=1.0, step_length=0.2, lift=0.1, period=0.6, trunk_height=0.74)
     step = steering.walk(robot, (), footsteps.initial_nodes(robot), 0, asked).step
     assert np.allclose(step.end.ankle_positions, [[0.2, 0.1, 0.04], [0, -0.1, 0.04]])
-    assert np.allclose(step.end.trunk_position, [0.1, 0, 0.74])
+    assert np.allclose(step.end.trunk_position[1:], [0, 0.74])
+    assert np.allclose(centre_of_mass(robot, step.end), [0.1, 0], atol=1e-3)
     assert (step.period, *step.swing, *step.lift) == (pytest.approx(0.6), 1, 0, 0.1, 0)
     following = steering.walk(robot, (), step.end, 1, asked).step
     assert np.allclose(following.end.ankle_positions, [[0.2, 0.1, 0.04], [0.4, -0.1, 0.04]])
@@ -145,7 +158,7 @@ def test_a_trunk_handle_gives_the_wishes_that_put_the_trunk_there(robot: robots.
     asked = Steering(trunk_ahead=0.03, trunk_aside=-0.02, trunk_height=0.7, trunk_roll=0.05, trunk_pitch=-0.1, trunk_yaw=0.2)
     end = steering.trunk_step(robot, start, asked).end
     found = steering.trunk_at(robot, start, end.trunk_position, end.trunk_orientation, Steering())
-    assert np.allclose(found, asked)
+    assert np.allclose(found, asked, atol=1e-4)
 
 
 def test_euler_angles_and_back() -> None:
@@ -329,7 +342,7 @@ def test_a_script_runs_to_its_end_and_again_in_a_loop(drive: Drive) -> None:
     at = go(drive, footsteps.duration(script) + 0.1)
     assert drive.mode is Mode.STEER
     assert "over" in drive.note
-    assert at[0] == pytest.approx(0.5, abs=0.05)
+    assert at[0] == pytest.approx(0.45, abs=0.05)  # bent knees carry the centre of mass ahead of the trunk
     drive.run(script, loop=True)
     go(drive, footsteps.duration(script) + 0.5)
     assert drive.mode is Mode.SCRIPT

@@ -24,7 +24,7 @@ from bipedtrack import robot as robots
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 
 ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
-FIRST = ROOT / "models" / "policies" / "first.npz"
+FIRST = ROOT / "models" / "policies" / "best.npz"
 WALK = ROOT / "curricula" / "footsteps" / "walk.csv"
 ENVIRONMENT = os.environ | {
     "PYTHONPATH": str(ROOT),
@@ -66,7 +66,7 @@ class Runs(NamedTuple):
 
 RANDOM = ("--tasks", "walk-forward", "--episodes", "2", "--seconds", str(SECONDS))
 COMMANDS = Runs(
-    (str(FIRST), *RANDOM), ("zero", *RANDOM), (str(FIRST), "silent/first.npz", "--script", str(WALK), "--engine", "mujoco")
+    (str(FIRST), *RANDOM), ("zero", *RANDOM), (str(FIRST), "silent/best.npz", "--script", str(WALK), "--engine", "mujoco")
 )
 
 
@@ -78,7 +78,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[pathlib.P
     network = shipped.network._replace(weights=tuple(0 * w for w in shipped.network.weights))
     silent = dataclasses.replace(shipped, network=network._replace(biases=tuple(0 * b for b in network.biases)))
     (folder / "silent").mkdir()
-    policy.save(dataclasses.replace(silent, provenance={"curriculum": "none"}), folder / "silent" / "first.npz")
+    policy.save(dataclasses.replace(silent, provenance={"curriculum": "none"}), folder / "silent" / "best.npz")
     options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
     processes = {}
     for out, arguments in COMMANDS._asdict().items():
@@ -213,7 +213,7 @@ def test_feedback_ratio_0_is_ik(short: pathlib.Path, tmp_path: pathlib.Path) -> 
             del figures["feedback_mean"], figures["feedback_max"]
         assert ablated[engine] == ik[engine]
     # curves and paths, which the report draws, are every tenth entry of what was recorded
-    arrays = dict(np.load(tmp_path / "traces" / "1-first-mujoco-short-0.npz"))
+    arrays = dict(np.load(tmp_path / "traces" / "1-best-mujoco-short-0.npz"))
     assert arrays["alive"].all() and len(arrays["time"]) == 80
     course, path = (ablated["mujoco"][name] for name in ("course", "path"))
     said = errors(nodes(arrays, "target"), nodes(arrays, "measured"))
@@ -297,11 +297,11 @@ LINE = re.compile(
 
 def test_the_table_has_a_line_for_each_policy_and_engine(runs: Runs) -> None:
     expected = [
-        (runs.first, [(str(FIRST), "first", engine) for engine in ENGINES], "walk-forward"),
+        (runs.first, [(str(FIRST), "best", engine) for engine in ENGINES], "walk-forward"),
         (runs.zero, [("zero", "zero", engine) for engine in ENGINES], "walk-forward"),
         (
             runs.script,
-            [(name, pathlib.Path(name).stem, engine) for name in (str(FIRST), "silent/first.npz") for engine in ENGINES[1:]],
+            [(name, pathlib.Path(name).stem, engine) for name in (str(FIRST), "silent/best.npz") for engine in ENGINES[1:]],
             "walk",
         ),
     ]
@@ -346,7 +346,7 @@ def test_metrics_say_what_was_asked_of_whom_and_with_what(runs: Runs) -> None:
     for package in ("jax", "mujoco", "mujoco-mjx", "numpy"):
         assert record["versions"][package] == metadata.version(package)
     assert record["policies"] == {str(FIRST): policy.load(FIRST).provenance}
-    assert runs.script.record["policies"]["silent/first.npz"] == {"curriculum": "none"}
+    assert runs.script.record["policies"]["silent/best.npz"] == {"curriculum": "none"}
     assert runs.zero.record["policies"] == {"zero": {}}
     assert runs.script.record["options"]["script"] == str(WALK)
 
@@ -404,9 +404,9 @@ def test_the_page_needs_no_other_address(runs: Runs) -> None:
 
 def test_errors_of_the_traces_are_those_of_the_summary(runs: Runs, mj_model: mujoco.MjModel) -> None:
     # the summary is over all episodes, and all have their traces here
-    groups = [(runs.first, str(FIRST), "walk-forward", "0-first", engine, (0, 1)) for engine in ENGINES[:2]]
+    groups = [(runs.first, str(FIRST), "walk-forward", "0-best", engine, (0, 1)) for engine in ENGINES[:2]]
     groups += [(runs.zero, "zero", "walk-forward", "0-zero", engine, (0, 1)) for engine in ENGINES[:2]]
-    named = ((str(FIRST), "0-first"), ("silent/first.npz", "1-first"))
+    named = ((str(FIRST), "0-best"), ("silent/best.npz", "1-best"))
     groups += [(runs.script, name, "walk", stem, "mujoco", (0,)) for name, stem in named]
     left = {run.out.name: set(run.traces) for run in runs}
     for run, name, task, stem, engine, episodes in groups:
@@ -442,7 +442,7 @@ def test_engines_agree_and_every_policy_has_the_same_episodes(runs: Runs) -> Non
     for episode in (0, 1):
         targets = [
             nodes(run.traces[f"0-{stem}-{engine}-walk-forward-{episode}"], "target")
-            for run, stem in ((runs.first, "first"), (runs.zero, "zero"))
+            for run, stem in ((runs.first, "best"), (runs.zero, "zero"))
             for engine in ENGINES[:2]
         ]
         for other in targets[1:]:
@@ -455,7 +455,7 @@ def test_zero_keeps_its_joint_targets_in_both_engines(runs: Runs) -> None:
         for episode in (0, 1):
             arrays, acting = (
                 run.traces[f"0-{stem}-{engine}-walk-forward-{episode}"]
-                for run, stem in ((runs.zero, "zero"), (runs.first, "first"))
+                for run, stem in ((runs.zero, "zero"), (runs.first, "best"))
             )
             first = arrays["qpos"][0, 7:]
             np.testing.assert_allclose(arrays["joint_targets"], np.tile(first, (TICKS, 1)), atol=1e-5)
@@ -464,6 +464,6 @@ def test_zero_keeps_its_joint_targets_in_both_engines(runs: Runs) -> None:
 
 
 def test_policies_of_the_same_file_name_keep_their_own_traces(runs: Runs) -> None:
-    one, other = (runs.script.traces[f"{stem}-mujoco-walk-0"] for stem in ("0-first", "1-first"))
+    one, other = (runs.script.traces[f"{stem}-mujoco-walk-0"] for stem in ("0-best", "1-best"))
     assert np.abs(one["feedback"]).max() > 0.05 and (other["feedback"] == 0).all()
     assert np.abs(one["qpos"] - other["qpos"])[:100].max() > 1e-3

@@ -62,7 +62,7 @@ def test_without_packets_it_stands(follower: Follower, robot: Robot) -> None:
     for command in advance(follower, 300):
         assert_equal(command.target, footsteps.initial_nodes(robot))
         assert_equal(command.end, footsteps.initial_nodes(robot))
-        assert not any(rate.any() for rate in command.rates) and not command.timer.any()
+        assert all(np.abs(rate).max() < 1e-6 for rate in command.rates) and not command.timer.any()
     assert follower.state == "standing"
 
 
@@ -114,7 +114,8 @@ def test_without_them_a_lifted_foot_is_taken_to_land_beneath(follower: Follower,
         commands = advance(follower, 4)
     assert_equal(commands[-1].target, up)
     assert_equal(commands[-1].end, shifted(robot, foot=(0.05, 0, 0)))
-    assert commands[-1].timer.tolist() == [0.3, 0]
+    # in the air since the second of 40 control steps
+    np.testing.assert_allclose(commands[-1].timer, [0.55 - 39 * DT, 0])
     follower.accept(Packet(10, 0.2, shifted(robot, foot=(0.05, 0, 0.03))))
     timers = [command.timer[0] for command in advance(follower, 5)]
     # 6 cm high, and half of it falls in 25 ms
@@ -185,8 +186,17 @@ def test_a_trunk_too_high_for_both_legs_comes_down_to_the_feet(follower: Followe
     assert kinematics.reachable(robot, *nodes.ankles_in_trunk_frame(found))
 
 
+def test_a_trunk_too_far_ahead_of_both_feet_comes_back_to_them(follower: Follower, robot: Robot) -> None:
+    ahead = shifted(robot, dx=0.28, dz=0.1)
+    assert not kinematics.reachable(robot, *nodes.ankles_in_trunk_frame(ahead))
+    follower.accept(Packet(1, 0.0, ahead))
+    found = advance(follower, 100)[-1].target
+    np.testing.assert_allclose(found.ankle_positions, ahead.ankle_positions, atol=1e-9)
+    assert kinematics.reachable(robot, *nodes.ankles_in_trunk_frame(found), 1e-6)
+
+
 def test_a_foot_out_of_reach_comes_to_where_the_leg_reaches(follower: Follower, robot: Robot) -> None:
-    far = shifted(robot, dx=-0.15, foot=(0.35, 0, 0))
+    far = shifted(robot, dx=-0.1, foot=(0.35, 0, 0))
     assert not kinematics.reachable(robot, *nodes.ankles_in_trunk_frame(far))
     follower.accept(Packet(1, 0.0, far))
     found = advance(follower, 50)[-1].target
@@ -220,9 +230,11 @@ def test_after_a_silence_it_stands_over_its_feet_on_the_ground_under_them(robot:
     commands += advance(follower, ticks(2))
     assert follower.state == "standing"
     assert_smooth(commands)
+    ankles, yaw = commands[-1].target.ankle_positions, rotations.from_yaw(np.float64(0.2))
+    trunk = np.array([0.075, 0.0, footsteps.TRUNK_HEIGHT + 0.025])
     wanted = Nodes(
-        trunk_position=np.array([0.075, 0.0, footsteps.TRUNK_HEIGHT + 0.025]),
-        trunk_orientation=rotations.from_yaw(np.float64(0.2)),
+        trunk_position=footsteps.balanced(robot, Nodes(trunk, yaw, ankles, np.array([0.3, 0.1])), trunk[:2]).trunk_position,
+        trunk_orientation=yaw,
         ankle_positions=np.array([[0.15, 0.1, 0.05 + robot.ankle_height], [0, -0.1, robot.ankle_height]]),
         ankle_yaws=np.array([0.3, 0.1]),
     )
@@ -282,7 +294,7 @@ def test_whatever_valid_packets_ask_for_the_targets_stay_smooth_and_within_reach
         commands.append(follower.advance())
         ankles, _ = nodes.ankles_in_trunk_frame(commands[-1].target)
         nearest, _ = kinematics.project(robot, *nodes.ankles_in_trunk_frame(commands[-1].target))
-        assert np.abs(nearest - ankles).max() < 0.15  # between two reachable targets
+        assert np.abs(nearest - ankles).max() < 0.2  # between two reachable targets
         assert commands[-1].target.ankle_positions[:, 2].min() > robot.ankle_height - 1e-6
     assert accepted > 20
     assert_smooth(commands)

@@ -189,10 +189,10 @@ def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_the_shipped_policy_comes_first_and_a_given_one_before_it(tmp_path: Path) -> None:
-    assert next(iter(play.choice(None))) == "first"
+    assert next(iter(play.choice(None))) == "best"
     given = tmp_path / "mine.npz"
-    assert list(play.choice(given))[:2] == ["mine", "first"]
-    assert list(play.choice(tmp_path / "first.npz"))[0] == str(tmp_path / "first.npz")
+    assert list(play.choice(given))[:2] == ["mine", "best"]
+    assert list(play.choice(tmp_path / "best.npz"))[0] == str(tmp_path / "best.npz")
 
 
 # In a browser

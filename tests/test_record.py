@@ -38,8 +38,8 @@ def test_boxes_are_those_of_the_task() -> None:
 
 
 def test_policies_are_named_shortly_where_that_tells_them_apart() -> None:
-    short = record.labels_of(evaluated("runs/best/policy.npz", "models/first.npz", "ik"))
-    assert list(short.values()) == ["best", "first", "ik"]
+    short = record.labels_of(evaluated("runs/mine/policy.npz", "models/best.npz", "ik"))
+    assert list(short.values()) == ["mine", "best", "ik"]
     whole = record.labels_of(evaluated("runs/best/policy.npz", "other/best/policy.npz", "policy.npz"))
     assert list(whole.values()) == ["runs/best/policy.npz", "other/best/policy.npz", "policy.npz"]
 

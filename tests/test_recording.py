@@ -51,7 +51,7 @@ def quick_compile() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def first() -> policy.Policy:
     """The policy that ships."""
-    return policy.load(paths.data_dir("models") / "policies" / "first.npz", robots.load())
+    return policy.load(paths.data_dir("models") / "policies" / "best.npz", robots.load())
 
 
 @pytest.fixture(scope="module")
