@@ -1,5 +1,7 @@
 """The task steps of Table II drawn at random: what an episode asks for, and each of its task steps in turn.
 
+`wander` is ours: every foothold anywhere within reach, and another posture with every step.
+
 All that lessons change (ranges, shares, hold) is data in a `Distribution`, so one compiled program serves every lesson.
 Random numbers are jax's; the namespace is jax.numpy.
 """
@@ -19,8 +21,8 @@ from bipedtrack.planner import TaskStep
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array
 
-KINDS = ("stand", "squat", "walk", "sidle", "turn", "stairs")
-STAND, SQUAT, WALK, SIDLE, TURN, STAIRS = range(len(KINDS))
+KINDS = ("stand", "squat", "walk", "sidle", "turn", "wander", "stairs")
+STAND, SQUAT, WALK, SIDLE, TURN, WANDER, STAIRS = range(len(KINDS))
 MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
 FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
@@ -61,6 +63,9 @@ class Ranges(NamedTuple):
     foot_distance: tuple[float, float, float] = (0.17, 0.20, 0.30)  # m
     foot_yaw: tuple[float, float, float] = (-0.2, 0.0, 0.2)  # rad
     squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s
+    wander_x: tuple[float, float, float] = (-0.15, 0.0, 0.30)  # m, of a foothold from beside the other foot, ahead
+    wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.22)  # m, outwards
+    wander_yaw: tuple[float, float, float] = (-0.35, 0.0, 0.35)  # rad
     push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
 
     def validate(self) -> None:
@@ -81,6 +86,7 @@ class Shares(NamedTuple):
     sidle: float
     turn: float
     stairs: float
+    wander: float = 0.0
 
     def validate(self) -> None:
         """Raises ValueError where no kind can be drawn."""
@@ -91,7 +97,7 @@ class Shares(NamedTuple):
 class Distribution(NamedTuple):
     """What episodes are drawn from: arrays, carried along in the state of every environment."""
 
-    shares: Array  # (6,) cumulative, ending at 1
+    shares: Array  # (7,) cumulative in the order of KINDS, ending at 1
     hold_share: Array  # () share of the episodes that stop and hold
     hold_after: Array  # (2,) least and greatest number of task steps before the hold
     down_share: Array  # () share of the stairs that go down
@@ -133,8 +139,9 @@ def distribution(
     push_share: float = 0.0,
 ) -> Distribution:
     """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
-    total = jnp.array(shares, jnp.float32)
-    last = max(i for i, share in enumerate(shares) if share > 0)  # rounding must not leave room behind it
+    ordered = [getattr(shares, kind) for kind in KINDS]
+    total = jnp.array(ordered, jnp.float32)
+    last = max(i for i, share in enumerate(ordered) if share > 0)  # rounding must not leave room behind it
     scaled = {
         name: jnp.array([mild + difficulty * (low - mild), mild + difficulty * (high - mild)], jnp.float32)
         for name, (low, mild, high) in ranges._asdict().items()
@@ -219,6 +226,7 @@ def _motion(key: Array, given: Distribution, level: bool) -> tuple[Motion, dict[
             # the leading foot opens by twice the step, the other one closes up
             jnp.stack([zero, 2 * draw["sidle_step"], zero]),
             arc,
+            jnp.zeros(3),  # every step of a wanderer has its own
             jnp.stack([draw["stair_tread"], zero, zero]),
         ]
     )
@@ -287,6 +295,16 @@ def _foothold(motion: Motion, rise: Array, index: Array, advance: Array, start: 
     )
 
 
+def _anywhere(key: Array, given: Distribution, outwards: Array) -> Array:
+    """The advance (3,) to a foothold within an ellipse of what can be reached; outwards: 1 for the left foot, else -1."""
+    names = ("wander_x", "wander_y", "wander_yaw")
+    x, y, yaw = (_draw(key, names, given.ranges)[name] for name in names)
+    ends = [jnp.where(value < 0, *given.ranges[name]) for value, name in ((x, names[0]), (y, names[1]))]
+    far = jnp.hypot(x / jnp.where(ends[0] == 0, 1.0, ends[0]), y / jnp.where(ends[1] == 0, 1.0, ends[1]))
+    x, y = x / jnp.maximum(far, 1.0), y / jnp.maximum(far, 1.0)
+    return jnp.stack([x, outwards * y, yaw])
+
+
 def _choose(condition: Array, new: Array, old: Array) -> Array:
     return jnp.where(condition, new, old)
 
@@ -304,13 +322,18 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     bounds = given.ranges["period"]
     period = jnp.where(steps, jnp.clip(motion.period * vary[0], bounds[0], bounds[1]), 1.0)
     advance = jnp.where(motion.kind == STAIRS, motion.advance, motion.advance * vary[2])
+    wanders = motion.kind == WANDER
+    outwards = 1.0 - 2.0 * ((index + motion.first) % 2)
+    advance = jnp.where(wanders, _anywhere(jax.random.fold_in(key_posture, 1), given, outwards), advance)
 
     footholds, headings = _foothold(motion, task.stairs.rise, index, advance, start)
     ankles = _choose(steps, footholds, start.ankle_positions)
     yaws = _choose(steps, headings, start.ankle_yaws)
     draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric"), given.ranges)
     period = jnp.where(squats, draw["squat_period"], period)
-    posture = jax.tree.map(functools.partial(jnp.where, squats), _drawn_posture(draw), _upright(motion.trunk_height))
+    posture = jax.tree.map(
+        functools.partial(jnp.where, squats | wanders), _drawn_posture(draw), _upright(motion.trunk_height)
+    )
     moves = functools.partial(jnp.where, squats | steps)
     end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
     swing = jnp.where(steps, (jnp.arange(2) == (index + motion.first) % 2).astype(jnp.float32), 0.0)

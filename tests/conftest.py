@@ -72,7 +72,7 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
 
     @functools.cache
     def draw(kind: str, difficulty: float = 1.0, hold_after: tuple[int, int] | None = None) -> Episodes:
-        shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
+        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
         hold_share = 0.0 if hold_after is None else 1.0
         given = tasks.distribution(curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8))
         keys = jax.random.split(jax.random.PRNGKey(tasks.KINDS.index(kind)), count)

@@ -30,7 +30,7 @@ class Compiled(NamedTuple):
 
 
 def distribution(kind: str, difficulty: float = 0.5, hold: bool = False) -> tasks.Distribution:
-    shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
+    shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
     return tasks.distribution(tasks.Ranges(), shares, difficulty, float(hold), (0, 0))
 
 

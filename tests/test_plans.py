@@ -66,7 +66,7 @@ def laid(robot: Robot, unoptimised: None) -> Laid:
     """A random plan of each case, and its steps one by one: a key for the beginning and then one for each task step."""
 
     def distribution(kind: str, down: float, hold: int | None) -> tasks.Distribution:
-        shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
+        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
         after = (hold or 1, hold or 8)
         return tasks.distribution(tasks.Ranges(), shares, 1.0, float(hold is not None), after, down)
 

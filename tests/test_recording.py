@@ -59,7 +59,7 @@ def plan(robot: robots.Robot) -> plans.Plan:
     """An episode of each of KINDS. The last hurries: its task steps of 0.15 s are over before the recording is."""
 
     def given(kind: str) -> tasks.Distribution:
-        shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
+        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
         ranges = tasks.Ranges()._replace(walk_step=(0.03, 0.03, 0.25))
         return tasks.distribution(ranges, shares, 0.0 if kind == "stairs" else 1.0, 0.0, (0, 0), down_share=1.0)
 

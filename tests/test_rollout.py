@@ -22,7 +22,7 @@ def act(flat_observation: jax.Array) -> jax.Array:
 
 def batch() -> tasks.Distribution:
     def of(kind: str) -> tasks.Distribution:
-        shares = tasks.Shares(*(float(name == kind) for name in tasks.KINDS))
+        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
         return tasks.distribution(tasks.Ranges(), shares, 0.5, 0.0, (0, 0))
 
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(of, KINDS))

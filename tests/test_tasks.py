@@ -10,15 +10,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from bipedtrack import control, env, kinematics, nodes, tasks
+from bipedtrack import control, env, kinematics, nodes, rotations, tasks
 from bipedtrack import robot as robots
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.robot import Robot
 from bipedtrack.tasks import Shares
 
-STEPPING = ("walk", "sidle", "turn", "stairs")
+UPRIGHT = ("walk", "sidle", "turn", "stairs")  # the trunk stays level
+STEPPING = (*UPRIGHT, "wander")
 ALL_KINDS = pytest.mark.parametrize("kind", tasks.KINDS)
 STEPPING_KINDS = pytest.mark.parametrize("kind", STEPPING)
+UPRIGHT_KINDS = pytest.mark.parametrize("kind", UPRIGHT)
 
 
 def heading(orientation: np.ndarray) -> np.ndarray:
@@ -123,6 +125,21 @@ def test_walking_and_sidling_go_straight_both_ways(episodes: Callable, kind: str
     assert (steps[..., part] * direction[:, None] > -1e-5).all()
 
 
+def test_a_wanderer_steps_anywhere_within_reach_in_any_posture(episodes: Callable) -> None:
+    drawn = episodes("wander")
+    steps, outwards = moved(drawn), np.where(drawn.step.swing.argmax(axis=-1) == 0, 1, -1)
+    x, y, yaw = steps[..., 0], steps[..., 1] * outwards, steps[..., 2]
+    around = 0.1 * math.sin(0.35)  # by which turning about the place beside the other foot moves the ankle
+    for found, low, high in ((x, -0.15, 0.30), (y, -0.02, 0.22), (yaw, -0.35, 0.35)):
+        slack = 1e-5 if found is yaw else around
+        assert low - slack < found.min() < 0.6 * low and 0.8 * high < found.max() < high + slack
+    assert np.hypot(np.maximum(x, 0) / 0.30, np.maximum(y, 0) / 0.22).max() < 1.2  # the ellipse, and the turn
+    height = drawn.step.end.trunk_position[..., 2]
+    assert height.min() < 0.62 and height.max() > 0.77 and np.ptp(height, axis=1).min() > 0.01
+    attitudes = np.array([rotations.to_euler(q) for q in drawn.step.end.trunk_orientation.reshape(-1, 4)])
+    assert np.abs(attitudes[:, :2]).max(axis=0) == pytest.approx([0.15, 0.15], abs=0.01)
+
+
 def test_a_sidle_opens_to_its_side_and_closes(episodes: Callable) -> None:
     drawn = episodes("sidle")
     sideways = moved(drawn)[..., 1]
@@ -172,7 +189,7 @@ def test_stairs_go_up_and_down_one_tread_a_step(episodes: Callable, curriculum: 
     )
 
 
-@STEPPING_KINDS
+@UPRIGHT_KINDS
 def test_trunk_stays_level_and_the_centre_of_mass_over_the_feet_at_the_episodes_height(
     episodes: Callable, curriculum: Curriculum, kind: str, centres_of_mass: Callable
 ) -> None:
@@ -306,7 +323,7 @@ def test_difficulty_zero_is_the_mildest(
         assert drawn.step.period == pytest.approx(mild["period"], abs=1e-5)
         assert drawn.step.lift.sum(axis=-1) == pytest.approx(mild["lift"], abs=1e-6)
         assert (drawn.step.trigonometric == 0).all()
-        advance = {"walk": mild["walk_step"], "sidle": 0.0, "turn": 0.0, "stairs": mild["stair_tread"]}[kind]
+        advance = {"walk": mild["walk_step"], "sidle": 0.0, "turn": 0.0, "wander": 0.0, "stairs": mild["stair_tread"]}[kind]
         steps = moved(drawn)
         assert steps == pytest.approx(np.broadcast_to([advance, 0, 0], steps.shape), abs=1e-5)
         height = posture(drawn.step.start)["posture_height"]
@@ -360,10 +377,10 @@ def draw(curriculum: Curriculum, robot: Robot) -> Callable[[tasks.Distribution],
 
 
 def test_kinds_are_drawn_by_their_shares(curriculum: Curriculum, draw: Callable) -> None:
-    for shares in (Shares(1, 1, 2, 2, 2, 0), Shares(0, 3, 0, 1, 0, 4)):
+    for shares in (Shares(1, 1, 2, 2, 2, 0), Shares(0, 3, 0, 1, 0, 4, wander=2)):
         task = draw(tasks.distribution(curriculum.ranges, shares, 1.0, 0.0, (1, 8)))
-        expected = np.array(shares) / sum(shares)
-        found = np.bincount(task.motion.kind, minlength=6) / 2000
+        expected = np.array([getattr(shares, kind) for kind in tasks.KINDS]) / sum(shares)
+        found = np.bincount(task.motion.kind, minlength=len(tasks.KINDS)) / 2000
         assert (found[expected == 0] == 0).all()
         # four standard deviations of a share drawn 2000 times
         assert found == pytest.approx(expected, abs=4 * math.sqrt(0.25 / 2000))
