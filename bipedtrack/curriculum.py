@@ -102,13 +102,14 @@ class Stage:
     hold_share: float = 0.0  # share of the episodes that stop after some task steps and hold
     hold_after: tuple[int, int] = (1, 8)  # least and greatest number of task steps before a hold
     mix_share: float = 0.0  # share of the episodes on level ground that change their kind every few task steps
+    break_share: float = 0.0  # share of the stepping episodes that pause or close up every few task steps
 
     def __post_init__(self) -> None:
         if not self.lessons:
             raise ValueError(f"stage {self.name!r} has no lessons")
         if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon) < 0:
             raise ValueError("learning_rate, entropy_cost and clipping_epsilon must not be negative")
-        for name in ("hold_share", "mix_share"):
+        for name in ("hold_share", "mix_share", "break_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:

@@ -25,6 +25,7 @@ KINDS = ("stand", "squat", "walk", "sidle", "turn", "wander", "stairs")
 STAND, SQUAT, WALK, SIDLE, TURN, WANDER, STAIRS = range(len(KINDS))
 MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
 FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
+_BREAKS = (2.0, 7.0)  # task steps from one break to the next, and one more than the most
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
 
 
@@ -102,6 +103,7 @@ class Distribution(NamedTuple):
     hold_after: Array  # (2,) least and greatest number of task steps before the hold
     down_share: Array  # () share of the stairs that go down
     mix_share: Array  # () share of the episodes on level ground that change their kind every MIX_STEPS task steps
+    break_share: Array  # () share of the episodes that stop in stride, or bring the feet together, every few task steps
     push_share: Array  # () share of the episodes with pushes
     ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
 
@@ -125,6 +127,8 @@ class Task(NamedTuple):
     hold_after: Array  # () number of task steps after which every target stays where it is
     mixes: Array  # () bool: another motion every MIX_STEPS task steps
     key: Array  # of those motions
+    break_every: Array  # () number of task steps of which the last one is a break
+    pauses: Array  # () bool: in a break nothing moves; else the swing foot comes beside the other one
     push: Array  # () N s, the greatest impulse of a push
 
 
@@ -137,6 +141,7 @@ def distribution(
     down_share: float = 0.5,
     mix_share: float = 0.0,
     push_share: float = 0.0,
+    break_share: float = 0.0,
 ) -> Distribution:
     """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
     ordered = [getattr(shares, kind) for kind in KINDS]
@@ -152,6 +157,7 @@ def distribution(
         hold_after=jnp.array(hold_after, jnp.float32),
         down_share=jnp.float32(down_share),
         mix_share=jnp.float32(mix_share),
+        break_share=jnp.float32(break_share),
         push_share=jnp.float32(push_share),
         ranges=scaled,
     )
@@ -246,12 +252,16 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
     rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
     stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))
     hold_after = jnp.floor(_within(u[2], given.hold_after + jnp.array([0.0, 1.0])))
+    v: Array = jax.random.uniform(jax.random.fold_in(key_task, 1), (3,))
+    breaks = (v[0] < given.break_share) & ~still
     task = Task(
         motion=motion,
         stairs=stairs,
         hold_after=jnp.where(u[1] < given.hold_share, hold_after, 1e6).astype(jnp.int32),
         mixes=(u[3] < given.mix_share) & ~on_stairs,
         key=key_mix,
+        break_every=jnp.where(breaks, jnp.floor(_within(v[1], jnp.array(_BREAKS))), 1e6).astype(jnp.int32),
+        pauses=v[2] < 0.5,
         push=jnp.where(u[4] < given.push_share, given.ranges["push"][1], 0.0),
     )
 
@@ -272,14 +282,24 @@ def _present(given: Distribution, task: Task, index: Array) -> Motion:
     return jax.tree.map(lambda new, old: jnp.where(mixes, new, old), another, task.motion)
 
 
-def _foothold(motion: Motion, rise: Array, index: Array, advance: Array, start: Nodes) -> tuple[Array, Array]:
-    """The end positions (2, 3) and yaws (2,) of both ankles: the swing foot beside the stance foot, moved on."""
-    swing = (index + motion.first) % 2
+def _advances(task: Task, index: Array) -> Array:
+    """How many of the task steps before number `index` were no breaks."""
+    return index - index // task.break_every
+
+
+def _swings(task: Task, motion: Motion, index: Array) -> Array:
+    """The foot that swings in task step `index`, 0 left, 1 right: in turn, also after a pause."""
+    return (jnp.where(task.pauses, _advances(task, index), index) + motion.first) % 2
+
+
+def _foothold(motion: Motion, rise: Array, closes: Array, swing: Array, advance: Array, start: Nodes) -> tuple[Array, Array]:
+    """The end positions (2, 3) and yaws (2,) of both ankles: the swing foot beside the stance foot, moved on.
+
+    Where it closes the place of the feet stays where the stance foot is.
+    """
     stance = 1 - swing
     side = jnp.array([0.5, -0.5]) * FOOT_DISTANCE
     position, yaw = start.ankle_positions[stance], start.ankle_yaws[stance]
-    # when a sidle closes up, the place of the feet stays where the leading foot has put it
-    closes = (motion.kind == SIDLE) & (index % 2 == 1)
     advance = jnp.where(closes, 0.0, advance)
     new_yaw = yaw + advance[2]
     c, s = jnp.cos(yaw), jnp.sin(yaw)
@@ -287,7 +307,7 @@ def _foothold(motion: Motion, rise: Array, index: Array, advance: Array, start: 
     # stance foot -> middle of the place -> moved on -> swing foot
     x = s * side[stance] + c * advance[0] - s * advance[1] - s2 * side[swing]
     y = -c * side[stance] + s * advance[0] + c * advance[1] + c2 * side[swing]
-    foothold = position + jnp.stack([x, y, rise])
+    foothold = position + jnp.stack([x, y, jnp.where(closes, 0.0, rise)])
     mine = jnp.arange(2) == swing
     return (
         jnp.where(mine[:, None], foothold, start.ankle_positions),
@@ -297,12 +317,16 @@ def _foothold(motion: Motion, rise: Array, index: Array, advance: Array, start: 
 
 def _anywhere(key: Array, given: Distribution, outwards: Array) -> Array:
     """The advance (3,) to a foothold within an ellipse of what can be reached; outwards: 1 for the left foot, else -1."""
-    names = ("wander_x", "wander_y", "wander_yaw")
-    x, y, yaw = (_draw(key, names, given.ranges)[name] for name in names)
-    ends = [jnp.where(value < 0, *given.ranges[name]) for value, name in ((x, names[0]), (y, names[1]))]
-    far = jnp.hypot(x / jnp.where(ends[0] == 0, 1.0, ends[0]), y / jnp.where(ends[1] == 0, 1.0, ends[1]))
-    x, y = x / jnp.maximum(far, 1.0), y / jnp.maximum(far, 1.0)
-    return jnp.stack([x, outwards * y, yaw])
+    draw = _draw(key, ("wander_x", "wander_y", "wander_yaw"), given.ranges)
+
+    def share(name: str) -> Array:
+        """Of the way to the end of the range."""
+        low, high = given.ranges[name]
+        end = jnp.where(draw[name] < 0, low, high)
+        return draw[name] / jnp.where(end == 0, 1.0, end)
+
+    beyond = jnp.maximum(jnp.hypot(share("wander_x"), share("wander_y")), 1.0)
+    return jnp.stack([draw["wander_x"] / beyond, outwards * draw["wander_y"] / beyond, draw["wander_yaw"]])
 
 
 def _choose(condition: Array, new: Array, old: Array) -> Array:
@@ -314,8 +338,9 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     key_step, key_curve, key_posture = jax.random.split(key, 3)
     motion = _present(given, task, index)
     hold = index >= task.hold_after
+    breaks = index % task.break_every == task.break_every - 1
     squats = (motion.kind == SQUAT) & ~hold
-    steps = (motion.kind >= WALK) & ~hold
+    steps = (motion.kind >= WALK) & ~hold & ~(breaks & task.pauses)
 
     vary = jax.random.uniform(key_step, (3,))
     vary = _within(vary, given.ranges["step_variation"])
@@ -323,10 +348,13 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     period = jnp.where(steps, jnp.clip(motion.period * vary[0], bounds[0], bounds[1]), 1.0)
     advance = jnp.where(motion.kind == STAIRS, motion.advance, motion.advance * vary[2])
     wanders = motion.kind == WANDER
-    outwards = 1.0 - 2.0 * ((index + motion.first) % 2)
+    swings = _swings(task, motion, index)
+    outwards = 1.0 - 2.0 * swings
     advance = jnp.where(wanders, _anywhere(jax.random.fold_in(key_posture, 1), given, outwards), advance)
 
-    footholds, headings = _foothold(motion, task.stairs.rise, index, advance, start)
+    # a sidle's second foot closes up
+    closes = breaks | ((motion.kind == SIDLE) & (swings != motion.first))
+    footholds, headings = _foothold(motion, task.stairs.rise, closes, swings, advance, start)
     ankles = _choose(steps, footholds, start.ankle_positions)
     yaws = _choose(steps, headings, start.ankle_yaws)
     draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric"), given.ranges)
@@ -336,7 +364,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     )
     moves = functools.partial(jnp.where, squats | steps)
     end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
-    swing = jnp.where(steps, (jnp.arange(2) == (index + motion.first) % 2).astype(jnp.float32), 0.0)
+    swing = jnp.where(steps, (jnp.arange(2) == swings).astype(jnp.float32), 0.0)
     lift = swing * motion.lift * vary[1]
     u = jax.random.uniform(key_curve, (2, 3))
     points = planner.swing_points(
@@ -360,7 +388,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
 
 def stair_window(given: Distribution, task: Task, index: Array) -> Array:
     """Poses (3, 7) of the boxes around the tread of the stance foot during task step `index`: position m, quaternion."""
-    return terrain.upright(terrain.stair_boxes(task.stairs, jnp.minimum(index, task.hold_after)))
+    return terrain.upright(terrain.stair_boxes(task.stairs, _advances(task, jnp.minimum(index, task.hold_after))))
 
 
 class Source(NamedTuple):

@@ -47,6 +47,7 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: cur
         stage.hold_after,
         mix_share=stage.mix_share,
         push_share=lesson.push_share,
+        break_share=stage.break_share,
     )
     settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
     return env.TrackingEnv(robot.load(config.robot), settings, given)

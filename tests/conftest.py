@@ -71,10 +71,14 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
     batched = jax.jit(jax.vmap(one, (0, None)))
 
     @functools.cache
-    def draw(kind: str, difficulty: float = 1.0, hold_after: tuple[int, int] | None = None) -> Episodes:
+    def draw(
+        kind: str, difficulty: float = 1.0, hold_after: tuple[int, int] | None = None, break_share: float = 0.0
+    ) -> Episodes:
         shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
         hold_share = 0.0 if hold_after is None else 1.0
-        given = tasks.distribution(curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8))
+        given = tasks.distribution(
+            curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8), break_share=break_share
+        )
         keys = jax.random.split(jax.random.PRNGKey(tasks.KINDS.index(kind)), count)
         return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
 

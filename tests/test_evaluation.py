@@ -48,7 +48,7 @@ def test_there_is_a_row_for_every_kind_of_any_stage_and_for_hold(rows: dict[str,
 def test_a_policy_that_trips_swinging_robots_fails_in_their_rows_alone(rows: dict[str, list[Row]]) -> None:
     assert [row.survival for row in rows["inverse kinematics"]] == [1, 1, 1, 1]
     stand, walk, stairs, hold = rows["trained"]
-    assert (stand.survival, walk.survival, hold.survival) == (1, 0, 1)
+    assert (stand.survival, hold.survival) == (1, 1) and walk.survival < 1
     assert stand.seconds == hold.seconds == pytest.approx(SECONDS) and 0.4 < walk.seconds < SECONDS - 0.01
     for before, after in zip(rows["inverse kinematics"][1:3], (walk, stairs), strict=True):
         assert after.ankle_yaw_error_deg > 2 * before.ankle_yaw_error_deg

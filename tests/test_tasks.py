@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bipedtrack import control, env, kinematics, nodes, rotations, tasks
+from bipedtrack import control, env, kinematics, nodes, rotations, tasks, terrain
 from bipedtrack import robot as robots
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.robot import Robot
@@ -123,6 +123,44 @@ def test_walking_and_sidling_go_straight_both_ways(episodes: Callable, kind: str
     assert (np.sign(way) == direction).all()
     assert 0.25 < (direction > 0).mean() < 0.75
     assert (steps[..., part] * direction[:, None] > -1e-5).all()
+
+
+@pytest.mark.parametrize("kind", ["walk", "stairs", "wander"])
+def test_breaks_pause_or_bring_the_feet_together(episodes: Callable, kind: str) -> None:
+    drawn = episodes(kind, 1.0, None, 1.0)
+    places = moved(drawn)
+    for i, (every, pauses) in enumerate(zip(drawn.task.break_every, drawn.task.pauses, strict=True)):
+        step = jax.tree.map(lambda leaf, i=i: leaf[i], drawn.step)
+        breaks = np.arange(1, len(step.period) + 1) % every == 0
+        moves = step.swing.sum(axis=-1) == 1
+        assert 2 <= every <= 6 and (moves == ~(breaks & pauses)).all()
+        still = [(a == b).reshape(len(a), -1).all(axis=1) for a, b in zip(step.start, step.end, strict=True)]
+        assert (np.all(still, axis=0) == ~moves).all() and step.period[~moves] == pytest.approx(1.0)
+        feet = step.swing.argmax(axis=-1)[moves]
+        assert (feet[1:] != feet[:-1]).all()  # left and right in turn, also after a pause
+        if not pauses:
+            heights = step.end.ankle_positions[..., 2]
+            assert np.ptp(heights[breaks], axis=1).max() < 1e-5 and np.abs(places[i, breaks, :2]).max() < 0.04
+    assert 0.2 < drawn.task.pauses.mean() < 0.8
+
+
+def test_on_stairs_with_breaks_both_feet_stand_on_treads(episodes: Callable, robot: Robot) -> None:
+    """A foot stands where the boxes of the present task step have their top: tread number is height by riser."""
+    drawn = episodes("stairs", 1.0, None, 1.0)
+    stairs, step = drawn.task.stairs, drawn.step
+    for i, index in np.ndindex(*step.period.shape):
+        task = jax.tree.map(lambda leaf, i=i: leaf[i], drawn.task)
+        boxes = np.asarray(tasks.stair_window(None, task, index))
+        for place in (step.start, step.end):
+            for x, _, z in place.ankle_positions[i, index]:
+                level = round(float((z - robot.ankle_height - stairs.height[i]) / stairs.rise[i]))
+                if level < 1 and stairs.rise[i] > 0:
+                    continue  # on the ground
+                tops = boxes[:, 2] + 0.5 * terrain.STAIR_BOX[2]
+                under = (np.abs(boxes[:, 0] - x) < terrain.STAIR_BOX[0] / 2 - 0.05) & (np.abs(tops - z + 0.04) < 1e-4)
+                assert under.any(), (i, index)
+        if i == 20:
+            break
 
 
 def test_a_wanderer_steps_anywhere_within_reach_in_any_posture(episodes: Callable) -> None:
