@@ -8,17 +8,20 @@ Every further line is one task step; metres, radians and seconds, in the world f
 line may be left out. The robot starts standing with its feet at (0, ±0.1, 0), facing x, its trunk at the
 defaults. What the cells mean and what empty ones do:
 
-    foot                     left or right, the foot that steps; or both: no foot moves
-    x, y, yaw                of the point under the ankle when the foot is flat; empty: where the foot stands
+    foot                     left or right, the foot that steps; left up or right up, the foot that is held in the air;
+                             jump: both feet leave the ground at once; or both: no foot moves
+    x, y, yaw                of the point under the ankle when the foot is flat; empty: where the foot stands;
+                             of a jump, of the point midway between the feet
     z                        of the same point; empty: the top of the highest box at (x, y), else 0
     period                   empty: 0.55 s; rounded to a multiple of the control period
     lift                     above the higher end of the swing; 0 slides the foot straight; empty: 0.08 m
-    trunk_x, trunk_y         at the end of the step; empty: the centre of mass is midway between the feet
-    trunk_z                  absolute, as all; empty: 0.75 m above the mean height of the two footholds
+    trunk_x, trunk_y         at the end of the step; empty: the centre of mass is midway between the feet that stand
+    trunk_z                  absolute, as all; empty: 0.75 m above the mean height of the footholds
     trunk_roll, trunk_pitch  orientation is Rz(yaw) Ry(pitch) Rx(roll); empty: 0, level
     trunk_yaw                empty: the mean of the feet's yaws
 
-With `both`, x, y, z, yaw and lift stay empty and the period is how long the trunk takes. A line with nothing
+With `both`, x, y, z, yaw and lift stay empty and the period is how long the trunk takes. A foot that is up needs its z, and
+the other one can not step until it is down again. A line with nothing
 but `both` and perhaps a period holds: every target stays where it is. So does everything after the last line.
 A yaw counts modulo a whole turn; feet and trunk turn the shorter way.
 
@@ -121,6 +124,7 @@ class _Row(NamedTuple):
     line: int
     feet: tuple[int, ...]  # indices of the feet that step
     values: dict[str, float]
+    up: bool = False  # the foot is held in the air
 
 
 _Problems = defaultdict[int, list[str]]  # by line; line 0 is the file itself
@@ -161,7 +165,9 @@ def parse(text: str, robot: Robot, name: str) -> Script:
         step = task_step(robot, boxes.values(), now, row.feet, row.values)
         if boxes_known and _known(step.end):
             for foot in row.feet:
-                problems[row.line] += _foothold_problems(robot, boxes, step.end, foot)
+                judge = _air_problems if row.up else _foothold_problems
+                problems[row.line] += judge(robot, boxes, step.end, foot)
+            problems[row.line] += _support_problems(robot, boxes, step)
             if step.end is not step.start:
                 # the way begins out of reach where the line before ended there
                 out_of_reach = _reach_problems(robot, step, within_reach and _known(step.start))
@@ -307,10 +313,15 @@ def _read_row(line: int, header: list[str], cells: list[str], timestep: float, p
         for column in ("x", "y", "z", "yaw", "lift"):
             if column in values:
                 problems.append(f"{column} is {reprlib.repr(texts[column])}, but no foot moves; wanted it empty")
-    elif foot in LEGS:
-        feet = (LEGS.index(foot),)
+    elif foot.removesuffix(" up") in LEGS:
+        feet = (LEGS.index(foot.removesuffix(" up")),)
+        if foot.endswith(" up") and "z" not in values:
+            problems.append("z is empty; wanted the height at which the foot is held, m")
+            values["z"] = math.nan
+    elif foot == "jump":
+        feet = (0, 1)
     else:
-        problems.append(f"foot is {reprlib.repr(foot)}; wanted left, right or both")
+        problems.append(f"foot is {reprlib.repr(foot)}; wanted left, right, left up, right up, jump or both")
         feet, values["x"] = (0, 1), math.nan
     for column, least in (("period", timestep), ("lift", 0.0)):
         value = values.get(column, least)
@@ -319,7 +330,7 @@ def _read_row(line: int, header: list[str], cells: list[str], timestep: float, p
             problems.append(f"{column} is {value:g} {unit}; wanted at least {least:g} {unit}")
         if not value >= least:
             del values[column]  # places are judged all the same
-    return _Row(line, feet, values)
+    return _Row(line, feet, values, foot.endswith(" up"))
 
 
 def _number(text: str, what: str, unit: str, problems: list[str]) -> float:
@@ -344,18 +355,19 @@ def task_step(
       robot: its constants.
       boxes: what stands on the ground.
       start: where the last task step ended.
-      feet: indices of the feet that step, none where the trunk moves alone.
+      feet: indices of the feet that step, none where the trunk moves alone, both in a jump.
       values: the line's cells by the names of UNITS, without the empty ones.
     """
     given = values.get
     ankles, yaws = start.ankle_positions.copy(), start.ankle_yaws.copy()
-    for foot in feet:
-        x, y = given("x", ankles[foot, 0]), given("y", ankles[foot, 1])
+    places = _jumped(start, values) if len(feet) == len(LEGS) else dict.fromkeys(feet, values)
+    for foot, place in places.items():
+        x, y = place.get("x", ankles[foot, 0]), place.get("y", ankles[foot, 1])
         ankles[foot] = x, y, given("z", ground(boxes, x, y)) + robot.ankle_height
-        yaws[foot] += rotations.wrap(given("yaw", yaws[foot]) - yaws[foot])
+        yaws[foot] += rotations.wrap(place.get("yaw", yaws[foot]) - yaws[foot])
 
     holds = not feet and not any(column.startswith("trunk") for column in values)
-    end = start if holds else _over_feet(robot, start, ankles, yaws, values)
+    end = start if holds else _over_feet(robot, boxes, start, ankles, yaws, values)
     swing = np.array([float(foot in feet) for foot in range(len(LEGS))])
     lift = swing * given("lift", LIFT)
     return TaskStep(
@@ -369,10 +381,33 @@ def task_step(
     )
 
 
-def _over_feet(robot: Robot, start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: Mapping[str, float]) -> Nodes:
-    """Nodes with the trunk where `values` say, or else with the centre of mass over the feet's middle."""
+def _jumped(start: Nodes, values: Mapping[str, float]) -> dict[int, dict[str, float]]:
+    """Where each foot lands, x, y and yaw, when the point midway between the feet goes where `values` say."""
+    x, y, _ = start.ankle_positions.mean(axis=0)
+    yaw = float(start.ankle_yaws.mean())
+    turn = rotations.wrap(values.get("yaw", yaw) - yaw)
+    c, s = math.cos(turn), math.sin(turn)
+    middle = np.array([values.get("x", x), values.get("y", y)])
+    found = {}
+    for foot in range(len(LEGS)):
+        landing = middle + np.array([[c, -s], [s, c]]) @ (start.ankle_positions[foot, :2] - [x, y])
+        found[foot] = {"x": float(landing[0]), "y": float(landing[1]), "yaw": float(start.ankle_yaws[foot] + turn)}
+    return found
+
+
+def standing_feet(robot: Robot, boxes: Iterable[Box], ankles: np.ndarray) -> list[int]:
+    """Indices of the feet with ankles (2, 3), m, that stand on the ground or on a box."""
+    boxes = tuple(boxes)
+    soles = ankles - np.array([0.0, 0.0, robot.ankle_height])
+    return [foot for foot, (x, y, z) in enumerate(soles) if z - ground(boxes, x, y, z + _TOLERANCE) <= _TOLERANCE]
+
+
+def _over_feet(
+    robot: Robot, boxes: Iterable[Box], start: Nodes, ankles: np.ndarray, yaws: np.ndarray, values: Mapping[str, float]
+) -> Nodes:
+    """Nodes with the trunk where `values` say, or else with the centre of mass over the middle of the feet that stand."""
     given = values.get
-    x, y, z = ankles.mean(axis=0)
+    x, y, z = ankles[standing_feet(robot, boxes, ankles) or [0, 1]].mean(axis=0)
     z = given("trunk_z", z + TRUNK_HEIGHT - robot.ankle_height)
     angles = given("trunk_roll", 0.0), given("trunk_pitch", 0.0), given("trunk_yaw", yaws.mean())
     orientation = rotations.from_euler(*angles)
@@ -427,6 +462,24 @@ def _foothold_problems(robot: Robot, boxes: dict[int, Box], nodes: Nodes, foot: 
             f"{_cm(max(gaps))} below z = {z:g} m; wanted the whole sole of {size} on ground of one height"
         )
     return problems
+
+
+def _air_problems(robot: Robot, boxes: dict[int, Box], nodes: Nodes, foot: int) -> list[str]:
+    """What keeps a foot from being held in the air where it is: the ground, or a box."""
+    x, y, z = nodes.ankle_positions[foot] - np.array([0.0, 0.0, robot.ankle_height])
+    top = ground(boxes.values(), x, y)
+    if z > top + _TOLERANCE:
+        return []
+    return [f"the {LEGS[foot]} foot is not up, z = {z:g} m over ground at {top:g} m; wanted it higher, or without `up`"]
+
+
+def _support_problems(robot: Robot, boxes: dict[int, Box], step: TaskStep) -> list[str]:
+    """Whether a foot steps while the other one is in the air."""
+    stands = standing_feet(robot, boxes.values(), step.start.ankle_positions)
+    stepping = [int(foot) for foot in np.flatnonzero(step.swing)]
+    if len(stepping) != 1 or 1 - stepping[0] in stands:
+        return []
+    return [f"the {LEGS[1 - stepping[0]]} foot is in the air; wanted it down before the other one steps"]
 
 
 def _reach_problems(robot: Robot, step: TaskStep, on_the_way: bool) -> list[str]:

@@ -34,21 +34,22 @@ def text(robot: Robot, steps: Sequence[TaskStep], boxes: Sequence[Box] = ()) -> 
             continue
         if held:
             lines.append(_hold(held))
-        lines.append(_line(robot, step))
+        lines.append(_line(robot, step, boxes))
         held = 0.0
     if held or not steps:
         lines.append(_hold(held or footsteps.PERIOD))
     return "\n".join(lines) + "\n"
 
 
-def _line(robot: Robot, step: TaskStep) -> str:
+def _line(robot: Robot, step: TaskStep, boxes: Sequence[Box]) -> str:
     """One task step that moves something."""
-    end, foot = step.end, int(np.argmax(step.swing))
+    end, feet = step.end, np.flatnonzero(step.swing)
     cells = ["both", "", "", "", "", _number(step.period), ""]
-    if step.swing.any():
-        x, y, z = end.ankle_positions[foot]
-        place = (x, y, z - robot.ankle_height, rotations.wrap(end.ankle_yaws[foot]), step.period, step.lift[foot])
-        cells = [LEGS[foot], *map(_number, place)]
+    if len(feet):
+        (x, y, z), yaw = end.ankle_positions[feet].mean(axis=0), end.ankle_yaws[feet].mean()
+        place = (x, y, z - robot.ankle_height, rotations.wrap(yaw), step.period, step.lift[feet[0]])
+        up = " up" if len(feet) == 1 and feet[0] not in footsteps.standing_feet(robot, boxes, end.ankle_positions) else ""
+        cells = ["jump" if len(feet) == len(LEGS) else LEGS[feet[0]] + up, *map(_number, place)]
     return ",".join([*cells, *map(_number, [*end.trunk_position, *rotations.to_euler(end.trunk_orientation)])])
 
 

@@ -48,6 +48,7 @@ class _Random:
     kind: str
     narrowed: dict[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     down_share: float = 0.5
+    break_share: float = 0.0  # share of the episodes that pause or close up every few task steps
 
 
 _RANDOM = {
@@ -61,9 +62,14 @@ _RANDOM = {
     "turn-right": _Random("turn", {"turn_yaw": (-0.35, -0.05, -0.05)}),
     "stairs-up": _Random("stairs", down_share=0.0),
     "stairs-down": _Random("stairs", down_share=1.0),
+    "wander": _Random("wander"),
+    "walk-breaks": _Random("walk", break_share=1.0),
+    "stairs-breaks": _Random("stairs", break_share=1.0),
 }
-SCRIPTS = ("obstacles", "composite")
-MOVING = tuple(name for name in _RANDOM if name != "stand")
+BEYOND = ("one-legged-stance", "hop", "long-jump", "kick", "crouch-walk", "cross-step", "sway", "stepping-stones")
+"""Scripts of kinds that Table II does not have."""
+SCRIPTS = ("obstacles", "composite", *BEYOND)
+MOVING = tuple(name for name, what in _RANDOM.items() if name != "stand" and not what.break_share)
 HOLDS = tuple(f"hold-{name}" for name in MOVING)
 LONG_HOLDS = tuple(f"hold-60s-{name}" for name in MOVING)
 TASKS = (*_RANDOM, *HOLDS, *LONG_HOLDS, *SCRIPTS)
@@ -92,6 +98,7 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
     if what.kind == "stairs":
         narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
+    words += "; a pause or the feet together every few task steps" if what.break_share else ""
     levels = _grid(episodes) if what.kind == "stairs" else _thirds(what.kind, plan)
     return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words, levels)
 
@@ -159,4 +166,12 @@ def _distribution(ranges: tasks.Ranges, what: _Random, hold: bool, episode: int)
         riser, tread = RISERS[episode % len(RISERS)], TREADS[episode // len(RISERS) % len(TREADS)]
         narrowed |= {"stair_riser": (riser,) * 3, "stair_tread": (tread,) * 3}
     shares = tasks.Shares(**{kind: float(kind == what.kind) for kind in tasks.KINDS})
-    return tasks.distribution(ranges._replace(**narrowed), shares, 1.0, float(hold), HOLD_AFTER, down_share=what.down_share)
+    return tasks.distribution(
+        ranges._replace(**narrowed),
+        shares,
+        1.0,
+        float(hold),
+        HOLD_AFTER,
+        down_share=what.down_share,
+        break_share=what.break_share,
+    )

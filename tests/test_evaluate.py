@@ -143,7 +143,7 @@ REFUSALS = {  # the arguments and a part of the line
     "ik cut.npz": "cut.npz: ",
     "empty": "policy.npz: cannot be read",
     "ik --script nowhere.csv": "nowhere.csv: cannot be read (No such file or directory)",
-    "ik --script bad.csv": "bad.csv:3: foot is 'middle'; wanted left, right or both",
+    "ik --script bad.csv": "bad.csv:3: foot is 'middle'; wanted left, right, left up, right up, jump or both",
     "ik --episodes 0": "--episodes 0: must be at least 1",
     "ik --seconds 0": "--seconds 0.0: must lie in [0.1, 600]",
     "ik --seconds nan": "--seconds nan: must lie in [0.1, 600]",

@@ -81,8 +81,8 @@ def moving(plan: plans.Plan) -> np.ndarray:
 # Names
 
 
-def test_thirty_tasks_have_thirty_names() -> None:
-    assert len(suite.TASKS) == 30
+def test_every_task_has_a_name_of_its_own() -> None:
+    assert len(suite.TASKS) == len(set(suite.TASKS)) > 40
     assert set(suite.TASKS) == {*BASE, *HOLDS, "obstacles", "composite"}
 
 
