@@ -11,9 +11,10 @@ import math
 import pathlib
 from typing import Literal
 
-from bipedtrack import checkpoint, config, paths
+from bipedtrack import checkpoint, config, footsteps, paths, scripts
 from bipedtrack.control import ControlConfig
 from bipedtrack.rewards import RewardConfig
+from bipedtrack.robot import Robot
 from bipedtrack.tasks import Ranges, Shares
 
 
@@ -103,17 +104,22 @@ class Stage:
     hold_after: tuple[int, int] = (1, 8)  # least and greatest number of task steps before a hold
     mix_share: float = 0.0  # share of the episodes on level ground that change their kind every few task steps
     break_share: float = 0.0  # share of the stepping episodes that pause or close up every few task steps
+    scripts: tuple[str, ...] = ()  # footstep scripts that episodes follow too: names in curricula/footsteps, or files
+    script_share: float = 0.0  # share of the episodes that follow one of them
 
     def __post_init__(self) -> None:
         if not self.lessons:
             raise ValueError(f"stage {self.name!r} has no lessons")
         if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon) < 0:
             raise ValueError("learning_rate, entropy_cost and clipping_epsilon must not be negative")
-        for name in ("hold_share", "mix_share", "break_share"):
+        for name in ("hold_share", "mix_share", "break_share", "script_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:
             raise ValueError(f"hold_after must be two growing numbers of task steps, not {list(self.hold_after)}")
+
+        if bool(self.scripts) != (self.script_share > 0):
+            raise ValueError("scripts and script_share need each other")
 
     @property
     def steps(self) -> int:
@@ -190,6 +196,21 @@ def calls(curriculum: Curriculum) -> tuple[Call, ...]:
                 found.append(Call(len(found), stage, lesson, steps, rate, entropy, epsilon))
             done += lesson.steps
     return tuple(found)
+
+
+def scripts_of(stage: Stage, robot: Robot) -> list[footsteps.Script]:
+    """The footstep scripts of a stage. Raises config.ConfigError where one is missing, wrong or not on level ground."""
+    ready, found = scripts.ready(), []
+    for name in stage.scripts:
+        if name not in ready and not name.endswith(".csv"):
+            raise config.ConfigError(f"stage {stage.name!r}: no script named {name!r}; there are: {', '.join(ready)}")
+        try:
+            found.append(footsteps.load(ready.get(name, pathlib.Path(name)), robot))
+        except footsteps.ScriptError as error:
+            raise config.ConfigError(f"stage {stage.name!r}: {str(error).splitlines()[0]}") from None
+        if found[-1].boxes:
+            raise config.ConfigError(f"stage {stage.name!r}: script {name!r} has boxes; wanted one on level ground")
+    return found
 
 
 def load(name_or_path: str) -> Curriculum:

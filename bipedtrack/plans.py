@@ -6,13 +6,14 @@ Task steps do not depend on what the robot does, so an episode of random ones, a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import footsteps, robot, tasks
+from bipedtrack import footsteps, robot, tasks, terrain
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.rotations import Array
@@ -70,6 +71,88 @@ def _number(plan: Plan, index: Array) -> Array:
 
 
 PLANNED = tasks.Source(_begin, _next_step, _boxes, lambda plan, task: jnp.float32(0))
+
+
+class ScriptedTask(NamedTuple):
+    """What an episode keeps that is either drawn at random or one of a library's."""
+
+    random: tasks.Task
+    scripted: Array  # () bool
+    number: Array  # () of the plan in the library
+    pace: Array  # () factor on its periods
+
+
+def library(scripts: Sequence[footsteps.Script]) -> Plan:
+    """The plans of scripts and of their mirror images, (2 n, s, ...), the shorter ones filled up with holds; numpy.
+
+    The boxes are those of a staircase, out of the way; the scripts' own are left out.
+    """
+    both = [plan for script in scripts for plan in (script_plan(script), mirrored(script_plan(script)))]
+    longest = max(len(plan.steps.period) for plan in both)
+
+    def filled(plan: Plan) -> Plan:
+        missing = longest - len(plan.steps.period)
+        steps = jax.tree.map(lambda leaf: np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)]), plan.steps)
+        return Plan(steps, np.tile(terrain.parked(terrain.STAIR_BOXES), (longest, 1, 1)))
+
+    return jax.tree.map(lambda *leaves: np.stack(leaves).astype(np.float32), *map(filled, both))
+
+
+def mirrored(plan: Plan) -> Plan:
+    """The plan with left and right exchanged; numpy. Its boxes stay where they are."""
+
+    def nodes(place: Nodes) -> Nodes:
+        return Nodes(
+            trunk_position=place.trunk_position * [1, -1, 1],
+            trunk_orientation=place.trunk_orientation * [1, -1, 1, -1],
+            ankle_positions=place.ankle_positions[..., ::-1, :] * [1, -1, 1],
+            ankle_yaws=-place.ankle_yaws[..., ::-1],
+        )
+
+    steps = plan.steps
+    return plan._replace(
+        steps=steps._replace(
+            start=nodes(steps.start),
+            end=nodes(steps.end),
+            swing=steps.swing[..., ::-1],
+            lift=steps.lift[..., ::-1],
+            ankle_points=steps.ankle_points[..., ::-1, :, :] * [1, -1, 1],
+        )
+    )
+
+
+_PACES = (0.85, 1.2)
+
+
+def with_scripts(source: tasks.Source, plans: Plan, share: float) -> tasks.Source:
+    """A source of which a share of the episodes follows a library's plans, each at a pace of its own, and then holds."""
+    count, length = plans.boxes.shape[:2]
+
+    def begin(key: Array, given: Any, the_robot: robot.Robot) -> tuple[ScriptedTask, Nodes]:
+        key, key_script = jax.random.split(key)
+        u = jax.random.uniform(key_script, (3,))
+        drawn, start = source.begin(key, given, the_robot)
+        number = jnp.minimum((count * u[1]).astype(jnp.int32), count - 1)
+        task = ScriptedTask(drawn, u[0] < share, number, _PACES[0] + u[2] * (_PACES[1] - _PACES[0]))
+        return task, _either(task, jax.tree.map(lambda leaf: leaf[number, 0], on_device.steps.start), start)
+
+    def next_step(
+        key: Array, given: Any, task: ScriptedTask, index: Array, start: Nodes, the_robot: robot.Robot
+    ) -> TaskStep:
+        step = jax.tree.map(lambda leaf: leaf[task.number, jnp.minimum(index, length - 1)], on_device.steps)
+        period = jnp.round(task.pace * step.period / the_robot.timestep) * the_robot.timestep
+        drawn = source.next_step(key, given, task.random, index, start, the_robot)
+        return _either(task, step._replace(period=period), drawn)
+
+    def boxes(given: Any, task: ScriptedTask, index: Array) -> Array:
+        return jnp.where(task.scripted, on_device.boxes[task.number, 0], source.boxes(given, task.random, index))
+
+    on_device = jax.tree.map(jnp.asarray, plans)
+    return tasks.Source(begin, next_step, boxes, lambda given, task: source.push(given, task.random))
+
+
+def _either(task: ScriptedTask, scripted: Any, drawn: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(task.scripted, a, b), scripted, drawn)
 
 
 def step_numbers(plan: Any, timestep: float, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from bipedtrack.rotations import Array, namespace
 
 STAIR_BOX = (1.2, 2.0, 0.4)  # length, width, height of a tread's box, m
@@ -39,6 +41,11 @@ def stair_boxes(stairs: Stairs, level: Array) -> Array:
     there = (stairs.rise != 0) & (levels >= xp.where(up, 1, 0))
     z = xp.where(there, top - 0.5 * STAIR_BOX[2], PARKED - slots)
     return xp.stack([x, xp.zeros_like(x), z], axis=-1)
+
+
+def parked(count: int) -> Array:
+    """Poses (count, 7) of boxes that are not needed; numpy."""
+    return upright(np.array([[0.0, 0.0, PARKED - i] for i in range(count)]).reshape(-1, 3))
 
 
 def upright(centres: Array) -> Array:

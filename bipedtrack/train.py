@@ -196,7 +196,10 @@ def _job(options: Train) -> Job:
             plan, seed, devices = curriculum.of_run(directory)
         return Job(config.to_dict(plan), seed, options.devices or devices)
     plan = curriculum.load(options.curriculum)
-    plan.substeps(robot.load(plan.robot).timestep)
+    the_robot = robot.load(plan.robot)
+    plan.substeps(the_robot.timestep)
+    for stage in plan.stages:  # rather than in the last hour
+        curriculum.scripts_of(stage, the_robot)
     return Job(config.to_dict(plan), options.seed, options.devices)
 
 

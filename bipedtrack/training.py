@@ -21,7 +21,19 @@ from brax.training.agents.ppo import losses, networks
 from brax.training.agents.ppo import train as ppo
 from flax import linen
 
-from bipedtrack import __version__, autoreset, curriculum, distributed, env, observation, policy, robot, tasks, versions
+from bipedtrack import (
+    __version__,
+    autoreset,
+    curriculum,
+    distributed,
+    env,
+    observation,
+    plans,
+    policy,
+    robot,
+    tasks,
+    versions,
+)
 from bipedtrack.checkpoint import CheckpointError, RunDirectory
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.progress import Aside, Progress
@@ -50,7 +62,11 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: cur
         break_share=stage.break_share,
     )
     settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
-    return env.TrackingEnv(robot.load(config.robot), settings, given)
+    the_robot, source = robot.load(config.robot), tasks.RANDOM
+    if stage.scripts:
+        library = plans.library(curriculum.scripts_of(stage, the_robot))
+        source = plans.with_scripts(source, library, stage.script_share)
+    return env.TrackingEnv(the_robot, settings, given, source)
 
 
 def train(

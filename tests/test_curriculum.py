@@ -1,5 +1,6 @@
 """The shipped curricula, Table III by hand, the calls that a curriculum becomes, and every refusal with its place."""
 
+import dataclasses
 import itertools
 import pathlib
 
@@ -7,6 +8,7 @@ import pytest
 
 from bipedtrack import config, curriculum, paths
 from bipedtrack.curriculum import Curriculum, calls, load
+from bipedtrack.robot import Robot
 
 MINIMAL = """name = "mine"
 
@@ -210,3 +212,31 @@ def test_an_unknown_name_lists_the_curricula_there_are() -> None:
 def test_a_missing_file_is_refused_by_its_path(tmp_path: pathlib.Path) -> None:
     with pytest.raises(config.ConfigError, match="gone.toml: cannot be read"):
         curriculum.load(str(tmp_path / "gone.toml"))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("hopp",), "stage 'ground': no script named 'hopp'; there are: "),
+        (("gone.csv",), "stage 'ground': gone.csv: cannot be read"),
+        (("hop", "stairs"), "stage 'ground': script 'stairs' has boxes; wanted one on level ground"),
+    ],
+)
+def test_scripts_that_cannot_be_trained_with_are_refused(
+    tmp_path: pathlib.Path, robot: Robot, names: tuple[str, ...], words: str
+) -> None:
+    ground, hold = loaded(tmp_path, MINIMAL).stages
+    assert curriculum.scripts_of(hold, robot) == []
+    stage = dataclasses.replace(ground, scripts=("hop", "kick"), script_share=0.1)
+    assert [len(script.steps) > 5 for script in curriculum.scripts_of(stage, robot)] == [True, True]
+    with pytest.raises(config.ConfigError) as caught:
+        curriculum.scripts_of(dataclasses.replace(stage, scripts=names), robot)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="need each other"):
+        dataclasses.replace(ground, scripts=("hop",))
+
+
+@pytest.mark.parametrize("name", ["best", "paper", "quick", "smoke", "standard"])
+def test_scripts_of_the_curricula_that_ship_can_be_trained_with(name: str, robot: Robot) -> None:
+    for stage in load(name).stages:
+        assert len(curriculum.scripts_of(stage, robot)) == len(stage.scripts)

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bipedtrack import footsteps, planner, plans, tasks, terrain
+from bipedtrack import footsteps, planner, plans, rotations, tasks, terrain
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import Command, TaskStep
-from bipedtrack.plans import PLANNED, Plan, script_plan, step_numbers
+from bipedtrack.plans import PLANNED, Plan, library, mirrored, script_plan, step_numbers, with_scripts
 from bipedtrack.robot import Robot
 
 STEPS = 7
@@ -250,3 +250,62 @@ def test_an_environment_is_given_the_plan_and_after_its_end_the_last_step(robot:
         for part, known in zip(jax.tree.leaves(step), jax.tree.leaves(plan.steps), strict=True):
             assert (part == known[number]).all()
         assert (boxes == plan.boxes[number]).all()
+
+
+# Scripts to train with
+
+
+def test_a_mirrored_plan_asks_for_the_mirror_image(robot: Robot) -> None:
+    plan = script_plan(footsteps.parse(HEADER + SCRIPT + BOW, robot, "a.csv"))
+    other = mirrored(plan)
+    flip = np.array([1.0, -1.0, 1.0])
+    for number in range(len(plan.steps.period)):
+        for tick in (0, 30, 90):
+            one, image = command(plan, number, tick), command(other, number, tick)
+            for mine, its in ((one.target, image.target), (one.end, image.end)):
+                np.testing.assert_allclose(its.trunk_position, mine.trunk_position * flip, atol=1e-9)
+                np.testing.assert_allclose(its.ankle_positions, mine.ankle_positions[::-1] * flip, atol=1e-9)
+                np.testing.assert_allclose(its.ankle_yaws, -mine.ankle_yaws[::-1], atol=1e-9)
+                turns = [rotations.to_matrix(place.trunk_orientation) for place in (mine, its)]
+                np.testing.assert_allclose(turns[1], np.diag(flip) @ turns[0] @ np.diag(flip), atol=1e-9)
+            np.testing.assert_allclose(image.rates.ankle_velocities, one.rates.ankle_velocities[::-1] * flip, atol=1e-9)
+            np.testing.assert_allclose(image.timer, one.timer[::-1])
+    for leaf, twice in zip(jax.tree.leaves(plan.steps), jax.tree.leaves(mirrored(other).steps), strict=True):
+        np.testing.assert_array_equal(leaf, twice)
+
+
+def test_a_share_of_the_episodes_follows_the_scripts_at_a_pace_of_its_own(robot: Robot) -> None:
+    short, long = (footsteps.parse(HEADER + text, robot, "a.csv") for text in ("jump,0.1\n", SCRIPT))
+    stock = library([short, long])
+    assert stock.boxes.shape == (4, 5, 3, 7) and (stock.boxes[..., 2] < -5).all()
+    given = tasks.distribution(tasks.Ranges(), tasks.Shares(0, 0, 1, 0, 0, 0), 1.0, 0.0, (1, 8))
+    source = with_scripts(tasks.RANDOM, stock, 0.5)
+
+    @jax.jit
+    @jax.vmap
+    def follow(key: Any) -> Any:
+        task, start = source.begin(key, given, robot)
+
+        def one(start: Nodes, index: Any) -> Any:
+            step = source.next_step(key, given, task, index, start, robot)
+            return step.end, (step, source.boxes(given, task, index))
+
+        return task, start, jax.lax.scan(one, start, np.arange(7))[1]
+
+    task, start, (steps, boxes) = jax.tree.map(np.asarray, follow(jax.random.split(jax.random.PRNGKey(0), 200)))
+    assert 0.35 < task.scripted.mean() < 0.65
+    assert set(task.number[task.scripted]) == {0, 1, 2, 3} and np.ptp(task.pace) > 0.3
+    assert boxes.shape == (200, 7, 3, 7)
+    for i in range(200):
+        mine = at(steps, i)
+        if not task.scripted[i]:
+            assert (mine.swing.sum(axis=-1) == 1).all()
+            continue
+        theirs = at(stock.steps, task.number[i])
+        for index in range(7):
+            wanted, found = at(theirs, min(index, 4)), at(mine, index)
+            np.testing.assert_allclose(found.end.ankle_positions, wanted.end.ankle_positions, atol=1e-6)
+            np.testing.assert_allclose(found.start.trunk_position, wanted.start.trunk_position, atol=1e-6)
+            assert found.period == pytest.approx(task.pace[i] * wanted.period, abs=0.0026)
+        np.testing.assert_allclose(start.ankle_positions[i], [[0, 0.1, 0.04], [0, -0.1, 0.04]], atol=1e-6)
+    assert not steps.swing[task.scripted][:, -2:].any()  # in the end it holds
