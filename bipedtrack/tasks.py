@@ -64,9 +64,9 @@ class Ranges(NamedTuple):
     foot_distance: tuple[float, float, float] = (0.17, 0.20, 0.30)  # m
     foot_yaw: tuple[float, float, float] = (-0.2, 0.0, 0.2)  # rad
     squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s
-    wander_x: tuple[float, float, float] = (-0.15, 0.0, 0.30)  # m, of a foothold from beside the other foot, ahead
-    wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.22)  # m, outwards
-    wander_yaw: tuple[float, float, float] = (-0.35, 0.0, 0.35)  # rad
+    wander_x: tuple[float, float, float] = (-0.10, 0.0, 0.25)  # m, of a foothold from beside the other foot, ahead
+    wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.15)  # m, outwards
+    wander_yaw: tuple[float, float, float] = (-0.25, 0.0, 0.25)  # rad
     push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
 
     def validate(self) -> None:
@@ -359,9 +359,9 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     yaws = _choose(steps, headings, start.ankle_yaws)
     draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric"), given.ranges)
     period = jnp.where(squats, draw["squat_period"], period)
-    posture = jax.tree.map(
-        functools.partial(jnp.where, squats | wanders), _drawn_posture(draw), _upright(motion.trunk_height)
-    )
+    drawn, upright = _drawn_posture(draw), _upright(motion.trunk_height)
+    share = jnp.where(squats, 1.0, 0.5 * wanders)  # a wanderer goes half of the way that one who stands may go
+    posture = jax.tree.map(lambda there, here: here + share * (there - here), drawn, upright)
     moves = functools.partial(jnp.where, squats | steps)
     end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
     swing = jnp.where(steps, (jnp.arange(2) == swings).astype(jnp.float32), 0.0)
