@@ -29,9 +29,9 @@ test: setup
 train: setup
 	$(BIN)/python -m bipedtrack.train $(ARGS)
 
-# Films the policy that ships; needs no screen (EGL or OSMesa).
+# Films the policy that ships through every kind of task step; needs no screen (EGL or OSMesa).
 demo: setup
-	$(BIN)/python -m bipedtrack.video models/policies/best.npz --script curricula/footsteps/walk.csv --out demo.mp4
+	$(BIN)/python -m bipedtrack.video models/policies/best.npz --script curricula/footsteps/composite.csv --out demo.mp4
 
 format: setup
 	$(BIN)/ruff format .
