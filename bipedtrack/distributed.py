@@ -63,7 +63,7 @@ def join(coordinator: str, processes: int, process: int, detect: bool) -> Proces
     given: dict[str, Any] = {}
     if coordinator:
         _check(coordinator, processes, process)
-        # nobody but the processes that were told to should be able to come in
+        # it listens at this address alone, not at all of the machine's
         given = {"coordinator_address": coordinator, "num_processes": processes, "process_id": process}
         given |= {"coordinator_bind_address": coordinator, "cluster_detection_method": "deactivate"}
     import jax
