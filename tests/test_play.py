@@ -272,7 +272,7 @@ def test_a_bad_script_shows_its_error_and_a_good_one_runs_to_its_end(tab: Tab, p
     write(tab, page, f"{','.join(footsteps.COLUMNS)}\nleft,0.1\nright,0.2\nleft,0.2")
     tab.click("run")
     wait_until(lambda: "the script is over" in tab.text)
-    assert x_of(page) == pytest.approx(0.2, abs=0.05)
+    assert x_of(page) == pytest.approx(0.15, abs=0.05)
     assert "script:1" not in tab.text
 
 

@@ -83,7 +83,8 @@ def moving(plan: plans.Plan) -> np.ndarray:
 
 def test_every_task_has_a_name_of_its_own() -> None:
     assert len(suite.TASKS) == len(set(suite.TASKS))
-    assert set(suite.TASKS) == {*BASE, *HOLDS, "obstacles", "composite"}
+    more = {"wander", "walk-breaks", "stairs-breaks", "hold-wander", "hold-60s-wander"}
+    assert set(suite.TASKS) == {*BASE, *HOLDS, *suite.BEYOND, *more, "obstacles", "composite"}
 
 
 def test_an_episode_lasts_as_long_as_asked_and_a_hold_that_long_after_eight_steps() -> None:
