@@ -117,7 +117,6 @@ class Stage:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:
             raise ValueError(f"hold_after must be two growing numbers of task steps, not {list(self.hold_after)}")
-
         if bool(self.scripts) != (self.script_share > 0):
             raise ValueError("scripts and script_share need each other")
 

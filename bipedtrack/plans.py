@@ -18,6 +18,8 @@ from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.rotations import Array
 
+_PACES = (0.85, 1.2)  # least and greatest factor on the periods of a script that is trained with
+
 
 class Plan(NamedTuple):
     """Task steps one after another; the last one is repeated for ever, so it should hold."""
@@ -93,7 +95,7 @@ def library(scripts: Sequence[footsteps.Script]) -> Plan:
     def filled(plan: Plan) -> Plan:
         missing = longest - len(plan.steps.period)
         steps = jax.tree.map(lambda leaf: np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)]), plan.steps)
-        return Plan(steps, np.tile(terrain.parked(terrain.STAIR_BOXES), (longest, 1, 1)))
+        return Plan(steps, np.tile(terrain.parked(), (longest, 1, 1)))
 
     return jax.tree.map(lambda *leaves: np.stack(leaves).astype(np.float32), *map(filled, both))
 
@@ -119,9 +121,6 @@ def mirrored(plan: Plan) -> Plan:
             ankle_points=steps.ankle_points[..., ::-1, :, :] * [1, -1, 1],
         )
     )
-
-
-_PACES = (0.85, 1.2)
 
 
 def with_scripts(source: tasks.Source, plans: Plan, share: float) -> tasks.Source:

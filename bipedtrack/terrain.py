@@ -43,9 +43,9 @@ def stair_boxes(stairs: Stairs, level: Array) -> Array:
     return xp.stack([x, xp.zeros_like(x), z], axis=-1)
 
 
-def parked(count: int) -> Array:
-    """Poses (count, 7) of boxes that are not needed; numpy."""
-    return upright(np.array([[0.0, 0.0, PARKED - i] for i in range(count)]).reshape(-1, 3))
+def parked() -> Array:
+    """Poses (3, 7) of the boxes where there are no stairs; numpy."""
+    return upright(np.array([[0.0, 0.0, PARKED - i] for i in range(STAIR_BOXES)]))
 
 
 def upright(centres: Array) -> Array:

@@ -99,7 +99,9 @@ def train(
         if run:
             run.save_checkpoint(call.index, arrays, {"seed": seed})
         progress.finished(call)
-        jax.clear_caches()  # a call's programs serve no other call, and each holds hundreds of megabytes
+        # each call builds its functions anew, so what JAX remembers of the last one is hundreds of megabytes for nothing; the
+        # next part of a lesson finds its program in the cache on disk
+        jax.clear_caches()
     distributed.part(process)
     return params
 
