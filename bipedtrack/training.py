@@ -99,8 +99,8 @@ def train(
         if run:
             run.save_checkpoint(call.index, arrays, {"seed": seed})
         progress.finished(call)
-        # each call builds its functions anew, so what JAX remembers of the last one is hundreds of megabytes for nothing; the
-        # next part of a lesson finds its program in the cache on disk
+        # what JAX remembers of a call serves no other one and is hundreds of megabytes; the next part of a lesson finds its
+        # program in the cache on disk
         jax.clear_caches()
     distributed.part(process)
     return params
