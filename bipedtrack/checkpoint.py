@@ -8,6 +8,7 @@ only if it is byte for byte what was written. Nothing in it is executed, and not
 A run directory:
 
     run.json            the settings of the run, written last when it is created: what has it holds a run
+    start.npz           the checkpoint that the run began with, if it did not begin from nothing
     lock                locked by the process that trains; the system frees it however that process ends
     checkpoints/*.npz   the newest three, named by index
 
@@ -24,7 +25,7 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -240,6 +241,25 @@ def _os_errors(path: str | Path, action: str) -> Iterator[None]:
 # The run directory
 
 
+class Checkpoint(NamedTuple):
+    """The parameters of a training after one of its PPO calls."""
+
+    call: int  # its index; -1: what the run began with
+    arrays: dict[str, np.ndarray]
+    meta: dict[str, Any]
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Where the parameters come from: `training.provenance`."""
+        return self.meta.get("provenance", {})
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """A checkpoint from its file. Raises CheckpointError as `load_arrays` does."""
+    arrays, meta = load_arrays(path, "checkpoint")
+    return Checkpoint(meta.get("index", -1), arrays, meta.get("meta", {}))
+
+
 class RunDirectory:
     """The directory of one training run.
 
@@ -253,10 +273,14 @@ class RunDirectory:
         self._lock: int | None = None
         self._settings_file = self.path / "run.json"
         self._checkpoints = self.path / "checkpoints"
+        self._start = self.path / "start.npz"
 
     @classmethod
-    def create(cls, path: str | Path, settings: dict[str, Any]) -> "RunDirectory":
-        """A new run with these JSON-able `settings`. Raises RunError if there is a run at `path` already."""
+    def create(cls, path: str | Path, settings: dict[str, Any], start: Checkpoint | None = None) -> "RunDirectory":
+        """A new run with these JSON-able `settings` and what it begins with, if that is not nothing.
+
+        Raises RunError if there is a run at `path` already.
+        """
         run = cls(path)
         with _os_errors(path, "created"):
             run._checkpoints.mkdir(parents=True, exist_ok=True)
@@ -266,6 +290,8 @@ class RunDirectory:
                 raise RunError(f"{path}: already holds a run; go on with --resume or use another directory")
             if run._indices():
                 raise RunError(f"{path}: holds checkpoints without their run.json; use another directory")
+            if start is not None:
+                save_arrays(run._start, start.arrays, {"index": -1, "meta": start.meta}, "checkpoint")
             write_json(run._settings_file, settings)
         except BaseException:
             run.close()
@@ -307,8 +333,8 @@ class RunDirectory:
                 self._checkpoint(old).unlink(missing_ok=True)
         return path
 
-    def latest(self) -> tuple[int, dict[str, np.ndarray], dict[str, Any]] | None:
-        """(index, arrays, meta) of the newest intact checkpoint, None before the first; see also `warnings`.
+    def latest(self) -> Checkpoint | None:
+        """The newest intact checkpoint; before the first what the run began with, or None; see also `warnings`.
 
         Raises CheckpointError when there are checkpoints but none is intact.
         """
@@ -316,15 +342,15 @@ class RunDirectory:
         for index in reversed(self._indices()):
             path = self._checkpoint(index)
             try:
-                arrays, meta = load_arrays(path, "checkpoint")
-                if meta.get("index") != index:
-                    raise CheckpointError(f"{path}: is number {meta.get('index')}, renamed; wanted {index}")
-                return index, arrays, meta["meta"]
+                found = load_checkpoint(path)
+                if found.call != index:
+                    raise CheckpointError(f"{path}: is number {found.call}, renamed; wanted {index}")
+                return found
             except CheckpointError as error:
                 self.warnings.append(f"skipped {error}")
         if self.warnings:
             raise CheckpointError(f"{self.path}: no checkpoint is intact; {self.warnings[0]}")
-        return None
+        return load_checkpoint(self._start) if self._start.exists() else None
 
     def close(self) -> None:
         """Frees the lock, which otherwise lasts as long as the process."""

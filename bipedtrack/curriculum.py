@@ -106,6 +106,7 @@ class Stage:
     break_share: float = 0.0  # share of the stepping episodes that pause or close up every few task steps
     scripts: tuple[str, ...] = ()  # footstep scripts that episodes follow too: names in curricula/footsteps, or files
     script_share: float = 0.0  # share of the episodes that follow one of them
+    rewards: RewardConfig | None = None  # where they are others than the curriculum's
 
     def __post_init__(self) -> None:
         if not self.lessons:

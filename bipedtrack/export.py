@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from bipedtrack import checkpoint, config, curriculum, onnx_export, policy, robot, versions
+from bipedtrack import checkpoint, config, onnx_export, policy, robot, versions
 from bipedtrack.messages import fail, quiet_imports
 
 
@@ -62,19 +62,13 @@ def export(run: pathlib.Path, out: pathlib.Path) -> policy.Policy:
 
     Raises checkpoint.RunError or checkpoint.CheckpointError where the run or its checkpoint cannot be read.
     """
-    directory = checkpoint.RunDirectory(run)
-    plan, seed, _ = curriculum.of_run(directory)
-    found = directory.latest()
-    for warning in directory.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
-    if found is None:
-        raise checkpoint.CheckpointError(f"{run}: has no checkpoint yet; its first PPO call is not finished")
     with quiet_imports():
         from bipedtrack import training
 
-    index, arrays, _ = found
-    newest = training.to_policy(plan, arrays, training.provenance(plan, seed, index + 1))
-    policy.save(newest, out)
+    directory = checkpoint.RunDirectory(run)
+    newest = training.save_policy(directory, out)
+    for warning in directory.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     return newest
 
 

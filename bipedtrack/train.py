@@ -34,6 +34,8 @@ class Train:
     """The run directory; runs/<curriculum>-<seed> when not given."""
     seed: int = 0
     """Everything random follows from it."""
+    start: pathlib.Path | None = None
+    """A checkpoint (or a run directory: its newest one) whose network a new run begins with, instead of a random one."""
     resume: bool = False
     """Goes on with the run in the run directory, with its own curriculum and seed."""
     device: Literal["cpu", "gpu", "auto"] = "auto"
@@ -192,6 +194,8 @@ def _job(options: Train) -> Job:
     if options.devices < 0:
         raise config.ConfigError(f"--devices {options.devices}: must not be negative")
     if options.resume:
+        if options.start is not None:
+            raise config.ConfigError("--resume goes on from the run's own checkpoints; leave out --start")
         with contextlib.closing(checkpoint.RunDirectory.open(_folder(options))) as directory:
             plan, seed, devices = curriculum.of_run(directory)
         return Job(config.to_dict(plan), seed, options.devices or devices)
@@ -212,7 +216,23 @@ def _directory(options: Train, job: Job, process: Process) -> checkpoint.RunDire
     if options.resume:
         return checkpoint.RunDirectory.open(_folder(options))
     settings = dataclasses.asdict(job) | {"processes": process.count, "versions": _versions()}
-    return checkpoint.RunDirectory.create(_folder(options), settings)
+    start = None if options.start is None else _start(options.start, job.plan)
+    return checkpoint.RunDirectory.create(_folder(options), settings, start)
+
+
+def _start(path: pathlib.Path, plan: Curriculum) -> checkpoint.Checkpoint:
+    """The checkpoint to begin with. Raises CheckpointError where it is none or does not fit the curriculum's networks."""
+    with quiet_imports():
+        from bipedtrack import training
+
+    found = checkpoint.RunDirectory(path).latest() if path.is_dir() else checkpoint.load_checkpoint(path)
+    if found is None:
+        raise checkpoint.CheckpointError(f"--start {path}: has no checkpoint; wanted one, or a run with a finished PPO call")
+    try:
+        training.from_arrays(plan, found.arrays)
+    except checkpoint.CheckpointError as error:
+        raise checkpoint.CheckpointError(f"--start {path}: {error}") from None
+    return found
 
 
 def _train_along(job: Job, process: Process) -> None:
@@ -232,36 +252,41 @@ def _train(directory: checkpoint.RunDirectory, job: Job, description: str, proce
     import rich.console
 
     with quiet_imports():
-        from bipedtrack import policy, training
+        from bipedtrack import training
     from bipedtrack.progress import Progress
 
     stop = _stop_on_signals()
     plan, seed = job.plan, job.seed
     calls = curriculum.calls(plan)
     found = directory.latest()
-    finished = 0 if found is None else found[0] + 1
+    finished = 0 if found is None else found.call + 1
     with Progress(directory.path, plan, calls, sum(call.steps for call in calls[:finished])) as progress:
         for warning in directory.warnings:
             progress.say(f"warning: {warning}")
         progress.say(
             f"{plan.name}, seed {seed}, on {description}: {len(plan.stages)} stages, {len(calls)} PPO calls, "
             f"{sum(call.steps for call in calls) / 1e6:.1f} M policy steps, in {directory.path}"
-            + (f"; {finished} calls are done" if finished else "")
+            + (
+                ""
+                if found is None
+                else f"; {finished} calls are done"
+                if finished
+                else "; begins with another run's network"
+            )
         )
         try:
-            params = training.train(plan, directory, seed, job.devices, progress, stop, process)
+            training.train(plan, directory, seed, job.devices, progress, stop, process)
         except training.Stopped:
             saved = directory.latest()
             progress.say(
-                f"stopped; {0 if saved is None else saved[0] + 1} of {len(calls)} calls are saved. Go on with:\n"
+                f"stopped; {0 if saved is None else saved.call + 1} of {len(calls)} calls are saved. Go on with:\n"
                 f"  python -m bipedtrack.train --resume --out {directory.path}"
             )
             sys.exit(130)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    trained = training.to_policy(plan, training.to_arrays(params), training.provenance(plan, seed, len(calls)))
     path = directory.path / "policy.npz"
-    policy.save(trained, path)
+    trained = training.save_policy(directory, path)
     console = rich.console.Console()
     if plan.evaluation_episodes:
         _show_table(directory, plan, trained, console)

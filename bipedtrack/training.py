@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import pathlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -34,7 +35,7 @@ from bipedtrack import (
     tasks,
     versions,
 )
-from bipedtrack.checkpoint import CheckpointError, RunDirectory
+from bipedtrack.checkpoint import Checkpoint, CheckpointError, RunDirectory
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.progress import Aside, Progress
 
@@ -61,7 +62,8 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: cur
         push_share=lesson.push_share,
         break_share=stage.break_share,
     )
-    settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
+    rewards = stage.rewards or config.rewards
+    settings = env.EnvConfig(rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
     the_robot, source = robot.load(config.robot), tasks.RANDOM
     if stage.scripts:
         library = plans.library(curriculum.scripts_of(stage, the_robot))
@@ -85,19 +87,20 @@ def train(
     DistributedError where the processes do not agree.
     """
     found = run.latest() if run else None
-    params = None if found is None else from_arrays(config, found[1])
-    finished = distributed.from_first("finished calls", lambda: 0 if found is None else found[0] + 1, process)
-    if finished:
+    params = None if found is None else from_arrays(config, found.arrays)
+    last = distributed.from_first("last call", lambda: None if found is None else found.call, process)
+    if last is not None:
         blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), _template(config))
         params = distributed.share_arrays(blank if params is None else params, process)
-    for call in curriculum.calls(config)[finished:]:
+    origin = None if found is None else origin_of(found)
+    for call in curriculum.calls(config)[0 if last is None else last + 1 :]:
         params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
         arrays = to_arrays(params)
         if process.count > 1:
             distributed.require_agreement(arrays, process)
             progress.say(f"{process}, call {call.index + 1}: parameters {distributed.digest(arrays)}")
         if run:
-            run.save_checkpoint(call.index, arrays, {"seed": seed})
+            run.save_checkpoint(call.index, arrays, {"provenance": provenance(config, seed, call.index + 1, origin)})
         progress.finished(call)
         # what JAX remembers of a call serves no other one and is hundreds of megabytes; the next part of a lesson finds its
         # program in the cache on disk
@@ -347,12 +350,36 @@ def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], prov
     )
 
 
-def provenance(config: curriculum.Curriculum, seed: int, finished_calls: int) -> dict[str, Any]:
-    """Where a policy comes from: curriculum, seed, steps and versions."""
-    return {
+def save_policy(run: RunDirectory, path: str | pathlib.Path) -> policy.Policy:
+    """Writes the policy of a run's newest intact checkpoint to `path` and returns it.
+
+    Raises RunError, ConfigError or CheckpointError where the run or its checkpoint cannot be read.
+    """
+    config, _, _ = curriculum.of_run(run)
+    found = run.latest()
+    if found is None:
+        raise CheckpointError(f"{run.path}: has no checkpoint yet; its first PPO call is not finished")
+    newest = to_policy(config, found.arrays, found.provenance)
+    policy.save(newest, path)
+    return newest
+
+
+def origin_of(found: Checkpoint) -> dict[str, Any] | None:
+    """Where the parameters that the run of a checkpoint began with come from; None: from nothing but its seed."""
+    if found.call >= 0:
+        return found.provenance.get("origin")
+    return {**found.provenance, "parameters": distributed.digest(found.arrays)}
+
+
+def provenance(
+    config: curriculum.Curriculum, seed: int, finished_calls: int, origin: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Where a policy comes from: curriculum, seed, steps, versions, and what it began with if that was not nothing."""
+    found = {
         "curriculum": config.name,
         "seed": seed,
         "steps": sum(call.steps for call in curriculum.calls(config)[:finished_calls]),
         "bipedtrack": __version__,
         "versions": {row.name: row.found for row in versions.check()},
     }
+    return found if origin is None else {**found, "origin": origin}

@@ -398,6 +398,22 @@ def test_the_newest_three_checkpoints_are_kept(run):
     assert run.warnings == []
 
 
+def test_a_run_that_began_with_a_checkpoint_has_it_until_its_own_first_one(tmp_path):
+    origin = {"provenance": {"steps": 5}}
+    run = RunDirectory.create(tmp_path / "tuned", {}, checkpoint.Checkpoint(7, numbers(7), origin))
+    found = run.latest()
+    assert found.call == -1 and same(found.arrays, numbers(7)) and found.provenance == {"steps": 5}
+    assert files(run) == ["lock", "run.json", "start.npz"]
+    run.save_checkpoint(0, numbers(0), {})
+    assert run.latest().call == 0 and run.latest().provenance == {}
+    run.close()
+    (run.path / "checkpoints" / "0000.npz").unlink()
+    damaged = run.path / "start.npz"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="start.npz: is cut off"):  # never silently from nothing
+        run.latest()
+
+
 def test_checkpoints_are_ordered_as_numbers(run):
     for index in (9998, 9999, 10000, 10001):
         run.save_checkpoint(index, numbers(index), {})

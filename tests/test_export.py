@@ -42,7 +42,7 @@ def make_run(path, finished_calls=2, plan=PLAN):
     }
     run = checkpoint.RunDirectory.create(path, settings)
     for index in range(finished_calls):
-        run.save_checkpoint(index, random_arrays(plan, index), {"seed": SEED})
+        run.save_checkpoint(index, random_arrays(plan, index), {"provenance": training.provenance(plan, SEED, index + 1)})
     run.close()
     return path
 
@@ -221,7 +221,7 @@ def test_a_checkpoint_of_other_networks(refused, tmp_path):
     run = make_run(tmp_path / "run", 0)
     with contextlib.closing(checkpoint.RunDirectory.open(run)) as directory:
         wider = dataclasses.replace(PLAN, network=dataclasses.replace(PLAN.network, actor=(17,)))
-        directory.save_checkpoint(0, random_arrays(wider, 0), {"seed": SEED})
+        directory.save_checkpoint(0, random_arrays(wider, 0), {"provenance": training.provenance(wider, SEED, 1)})
     line = refused(run, "--out", tmp_path / "policy.npz")
     assert "does not fit the curriculum's networks" in line
     assert not (tmp_path / "policy.npz").exists()

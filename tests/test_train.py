@@ -209,6 +209,45 @@ def test_a_killed_and_resumed_run_ends_in_bitwise_the_same_parameters(runs: Runs
     assert (runs.whole / "policy.npz").read_bytes() == (runs.broken / "policy.npz").read_bytes()
 
 
+# A training that begins with another one's network
+
+
+@pytest.mark.slow
+def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(runs: Runs) -> None:
+    folder, first = runs.whole.parent, runs.whole / "checkpoints" / "0002.npz"
+    with running("--curriculum", "tiny.toml", "--out", "tuned", "--device", "cpu", "--start", first, cwd=folder) as tuned:
+        printed = wait_for(tuned, "(call 1 of 3)")
+        tuned.send_signal(signal.SIGINT)
+        status, out, error = finished(tuned)
+    assert status == 130 and "begins with" in printed and "stopped; 0 of 3 calls are saved" in out, printed + out + error
+    began, source = checkpoint.RunDirectory(folder / "tuned").latest(), checkpoint.load_checkpoint(first)
+    assert began.call == -1 and began.arrays.keys() == source.arrays.keys()
+    assert all(np.array_equal(began.arrays[name], source.arrays[name]) for name in source.arrays)
+
+    status, out, error = train("--resume", "--out", "tuned", "--device", "cpu", cwd=folder)
+    assert (status, error) == (0, ""), out + error
+    trained = policy.load(folder / "tuned" / "policy.npz")
+    assert trained.provenance["origin"]["steps"] == 576 and trained.provenance["origin"]["seed"] == 3
+    newest = checkpoint.RunDirectory(folder / "tuned").latest()
+    assert int(newest.arrays["0/count/lo"]) == 2 * 576  # the normaliser has seen both runs
+
+
+@pytest.mark.slow
+def test_what_cannot_be_started_from_is_refused_and_leaves_nothing_behind(runs: Runs, tmp_path: pathlib.Path) -> None:
+    smoke = (ROOT / "curricula" / "smoke.toml").read_text()
+    (tmp_path / "wider.toml").write_text(smoke.replace("critic = [16]", "critic = [17]"))
+    first, policy_file = runs.whole / "checkpoints" / "0002.npz", runs.whole / "policy.npz"
+    for arguments, wanted in {
+        ("--start", "missing.npz"): "missing.npz: cannot be read",
+        ("--start", policy_file): "is a policy file; wanted a checkpoint file",
+        ("--start", tmp_path): "has no checkpoint; wanted one",
+        ("--start", first, "--curriculum", "wider.toml"): "does not fit the curriculum's networks: 2/params/hidden_0/bias",
+        ("--start", first, "--resume"): "leave out --start",
+    }.items():
+        assert wanted in refused("--curriculum", "smoke", "--out", "run", "--device", "cpu", *arguments, cwd=tmp_path)
+        assert not (tmp_path / "run").exists()
+
+
 # Refusals
 
 

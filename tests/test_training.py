@@ -14,7 +14,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 from jax.experimental.compilation_cache import compilation_cache
 
-from bipedtrack import curriculum, policy, training
+from bipedtrack import checkpoint, curriculum, policy, training
 from bipedtrack.checkpoint import CheckpointError
 
 ACTIVATIONS = ("swish", "tanh", "relu")
@@ -221,8 +221,26 @@ def test_only_a_stage_with_stairs_pays_for_boxes() -> None:
     np.testing.assert_allclose(harder.given.ranges["walk_step"], [step[0], step[2]], atol=1e-7)
 
 
+def test_a_stage_with_rewards_of_its_own_uses_them() -> None:
+    config = curriculum.load("smoke")
+    own = config.rewards._replace(sharpness=config.rewards.sharpness._replace(trunk_position=77.0))
+    stages = [dataclasses.replace(config.stages[0], rewards=rewards) for rewards in (None, own)]
+    envs = [training.make_env(config, stage, stage.lessons[0]) for stage in stages]
+    assert [env.config.rewards for env in envs] == [config.rewards, own]
+
+
 def test_provenance_counts_the_steps_of_the_finished_calls() -> None:
     config = curriculum.load("smoke")
     found = training.provenance(config, 7, 2)
     assert (found["curriculum"], found["seed"], found["steps"]) == ("smoke", 7, 384)
     assert found["versions"]["brax"] == "0.14.2" and set(found["versions"]) >= {"jax", "mujoco", "numpy"}
+    assert "origin" not in found
+
+
+def test_provenance_tells_what_a_run_began_with_to_its_last_call() -> None:
+    config, arrays = curriculum.load("smoke"), {"w": np.zeros(3, np.float32)}
+    first = training.provenance(config, 7, 3)
+    begun = training.origin_of(checkpoint.Checkpoint(-1, arrays, {"provenance": first}))
+    assert begun is not None and begun["steps"] == 576 and len(begun["parameters"]) == 64
+    later = checkpoint.Checkpoint(0, arrays, {"provenance": training.provenance(config, 8, 1, begun)})
+    assert training.origin_of(later) == begun
