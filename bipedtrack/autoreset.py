@@ -28,7 +28,10 @@ class AutoReset(brax.envs.Wrapper):
     """A batch of TrackingEnvs for brax's ppo.train, with the info that it reads.
 
     info: `truncation` (1 on the step that begins a new episode), `episode_done` (1 on the last step of an episode, however
-    it ended), `episode_metrics` (sums over the episode so far).
+    it ended), `episode_metrics` (sums over the episode so far), `clock` (policy steps towards the time limit).
+
+    The first episodes end at any time up to the limit: robots that all began at once would all reach it at once, for ever,
+    and every update would see nothing but beginnings, or nothing but ends.
     """
 
     env: TrackingEnv
@@ -39,7 +42,7 @@ class AutoReset(brax.envs.Wrapper):
         self.episode_length = episode_length
 
     def reset(self, rng: Array) -> brax.envs.State:
-        """New episodes for keys (n, 2)."""
+        """New episodes for keys (n, 2), their clocks anywhere."""
         return jax.vmap(self._reset)(rng)
 
     def step(self, state: brax.envs.State, action: Array) -> brax.envs.State:
@@ -47,13 +50,14 @@ class AutoReset(brax.envs.Wrapper):
         return jax.vmap(self._step)(state, action)
 
     def _reset(self, rng: Array) -> brax.envs.State:
-        return self._with_info(self.env.reset(rng), truncation=0.0)
+        clock = jax.random.randint(jax.random.fold_in(rng, 0), (), 0, self.episode_length)
+        return self._with_info(self.env.reset(rng), clock, truncation=0.0)
 
-    def _with_info(self, state: brax.envs.State, truncation: float) -> brax.envs.State:
+    def _with_info(self, state: brax.envs.State, clock: Array, truncation: float) -> brax.envs.State:
         """The first state of an episode with its sums at zero."""
         zero = jnp.float32(0)
         sums = {"sum_reward": zero, "length": zero} | {_sum_name(name): zero for name in state.metrics}
-        info = {"truncation": jnp.float32(truncation), "episode_done": zero, "episode_metrics": sums}
+        info = {"truncation": jnp.float32(truncation), "episode_done": zero, "episode_metrics": sums, "clock": clock}
         return state.replace(info={**state.info, **info})
 
     def _step(self, state: brax.envs.State, action: Array) -> brax.envs.State:
@@ -65,13 +69,15 @@ class AutoReset(brax.envs.Wrapper):
             "length": sums["length"] + 1,
             **{_sum_name(name): sums[_sum_name(name)] + value for name, value in moved.metrics.items()},
         }
-        late = (sums["length"] >= self.episode_length).astype(jnp.float32)
+        clock = state.info["clock"] + 1
+        late = (clock >= self.episode_length).astype(jnp.float32)
         info = {
             "truncation": jnp.float32(0),
             "episode_done": jnp.maximum(moved.done, late),
             "episode_metrics": sums,
+            "clock": clock,
         }
         moved = moved.replace(info={**moved.info, **info})
-        fresh = self._with_info(self.env.begin(episode.key, episode.given), truncation=1.0)
+        fresh = self._with_info(self.env.begin(episode.key, episode.given), jnp.int32(0), truncation=1.0)
         over = state.info["episode_done"] > 0
         return jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
