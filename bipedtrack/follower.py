@@ -222,6 +222,7 @@ class Follower:
             ankle_points=np.stack(ankle_points, axis=1),
             lift=np.zeros(2),
             trigonometric=np.float64(0),
+            ease=np.float64(0),
         )
 
 

@@ -59,6 +59,7 @@ LIFT = 0.08  # m
 TRUNK_HEIGHT = 0.75  # m above the mean of the footholds
 FEET_Y = (0.1, -0.1)  # m, left and right at the start
 _ALONG = np.array([0.05, 0.5, 0.95])  # inner control points of the fourth-order swing curves, share of the way
+EASE = 0.25  # planner.TaskStep.ease
 _HEIGHTS = np.ones(3)  # and as multiples of the height that lifts a foot by `lift`
 _TOLERANCE = 1e-3  # m and rad: what is this close counts as touching, standing or within reach
 _LARGEST = 1e6  # m, rad or s
@@ -378,6 +379,7 @@ def task_step(
         ankle_points=planner.swing_points(start.ankle_positions, ankles, lift, _ALONG, _HEIGHTS),
         lift=lift,
         trigonometric=np.float64(0),
+        ease=np.float64(EASE),
     )
 
 

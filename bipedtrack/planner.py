@@ -3,6 +3,9 @@
 Ankles follow Bezier curves of any order (the paper's are of fourth order) or trigonometric ones; the trunk moves at
 uniform velocity and angular velocity; rates are analytic. Section III-C of the paper. A task step is data: whatever
 writes its control points plans the motion.
+
+A Bezier curve that is run through uniformly leaves the ground at up to 4 m/s, which no foot at rest can follow; `ease`
+lets it gather speed first. The paper says nothing of it; 0 is uniform.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ class TaskStep(NamedTuple):
     ankle_points: Array  # (2, n + 1, 3) Bezier control points in the world, m; constant for a stance foot
     lift: Array  # (2,) m, height of a trigonometric curve above its chord
     trigonometric: Array  # () 1: ankles follow trigonometric curves, 0: Bezier curves
+    ease: Array  # () share of the period in which Bezier curves gather speed from rest, and brake to rest; below 0.5
 
 
 class Command(NamedTuple):
@@ -58,6 +62,21 @@ def trigonometric(start: Array, end: Array, lift: Array, s: Array) -> tuple[Arra
     return point, along_rate * (end - start) + (math.pi * xp.sin(angle)) * up
 
 
+def eased(share: Array, ease: Array) -> tuple[Array, Array]:
+    """How far along a curve is at a share of the time, both in [0, 1], and the derivative; () each.
+
+    The speed rises evenly from zero during the first `ease` of the time, () in [0, 0.5), and falls evenly to zero during
+    the last; with 0 it is uniform.
+    """
+    xp = namespace(share)
+    top = 1 / (1 - ease)
+    from_end = xp.minimum(share, 1 - share)
+    ramp = xp.maximum(ease, xp.full_like(ease, 1e-6))
+    speed = top * xp.minimum(from_end / ramp, xp.ones_like(share))
+    way = xp.where(from_end < ease, 0.5 * speed * from_end, top * (from_end - 0.5 * ease))
+    return xp.where(share < 0.5, way, 1 - way), xp.where(ease > 0, speed, xp.ones_like(share))
+
+
 def command(step: TaskStep, time: Array) -> Command:
     """The command at `time` seconds, (), into the step; from the period on its end stands still (rates and T are zero)."""
     xp = namespace(step.period)
@@ -66,10 +85,11 @@ def command(step: TaskStep, time: Array) -> Command:
     per_second = running / step.period
     start, end = step.start, step.end
 
-    on_bezier, bezier_rate = bezier(step.ankle_points, s)
+    along, along_rate = eased(s, step.ease)
+    on_bezier, bezier_rate = bezier(step.ankle_points, along)
     on_sine, sine_rate = trigonometric(start.ankle_positions, end.ankle_positions, step.lift, s)
     ankles = xp.where(step.trigonometric > 0, on_sine, on_bezier)
-    ankle_rates = xp.where(step.trigonometric > 0, sine_rate, bezier_rate)
+    ankle_rates = xp.where(step.trigonometric > 0, sine_rate, along_rate * bezier_rate)
 
     turn = rotations.multiply(rotations.conjugate(start.trunk_orientation), end.trunk_orientation)
     turn = rotations.to_rotation_vector(turn)  # constant axis: the same in both trunk frames

@@ -50,6 +50,7 @@ class Ranges(NamedTuple):
     curve_along: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # shift of the Bezier control points, share of the way
     curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
     trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
+    swing_ease: tuple[float, float, float] = (0.2, 0.25, 0.3)  # planner.TaskStep.ease; 0: the paper's uniform curves
     posture_x: tuple[float, float, float] = (
         -0.05,
         0.0,
@@ -76,6 +77,8 @@ class Ranges(NamedTuple):
                 raise ValueError(f"{name} must be [lowest, mildest, highest], not {[low, mild, high]}")
         if self.period[0] <= 0 or self.squat_period[0] <= 0:
             raise ValueError("periods must be positive")
+        if not 0 <= self.swing_ease[0] <= self.swing_ease[2] < 0.5:
+            raise ValueError(f"swing_ease must lie in [0, 0.5), not {list(self.swing_ease)}")
 
 
 class Shares(NamedTuple):
@@ -357,7 +360,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     footholds, headings = _foothold(motion, task.stairs.rise, closes, swings, advance, start)
     ankles = _choose(steps, footholds, start.ankle_positions)
     yaws = _choose(steps, headings, start.ankle_yaws)
-    draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric"), given.ranges)
+    draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric", "swing_ease"), given.ranges)
     period = jnp.where(squats, draw["squat_period"], period)
     drawn, upright = _drawn_posture(draw), _upright(motion.trunk_height)
     share = jnp.where(squats, 1.0, 0.5 * wanders)  # a wanderer goes half of the way that one who stands may go
@@ -383,6 +386,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
         lift=lift,
         # a trigonometric curve rises above its chord, which passes through the tread between two others
         trigonometric=((draw["trigonometric"] > 0) & (motion.kind != STAIRS)).astype(jnp.float32),
+        ease=draw["swing_ease"],
     )
 
 

@@ -46,6 +46,7 @@ def random_step(random: np.random.Generator, trigonometric: float, order: int = 
         ankle_points=points,
         lift=swing * random.uniform(0.02, 0.2),
         trigonometric=np.asarray(trigonometric),
+        ease=np.asarray(random.choice([0.0, random.uniform(0.01, 0.49)])),
     )
     return jax.tree.map(lambda x: np.asarray(x, dtype), step)
 
@@ -72,6 +73,27 @@ def test_bezier_curve_of_any_order_is_the_bernstein_sum(order: int, random: np.r
         expected = bernstein(points[foot], s)
         assert value[foot] == pytest.approx(expected[0], abs=1e-12)
         assert slope[foot] == pytest.approx(expected[1], abs=1e-11)
+
+
+@pytest.mark.parametrize("ease", [0.0, 0.1, 0.25, 0.49])
+def test_eased_speed_rises_from_rest_stays_and_falls_to_rest(ease: float) -> None:
+    share = np.linspace(0, 1, 20_001)
+    way, speed = planner.eased(share, np.full_like(share, ease))
+    assert (way[0], way[-1]) == (0, 1) and way[10_000] == pytest.approx(0.5, abs=1e-12)
+    # the trapezoid by hand: its area is 1, so its top is 1 / (1 - ease)
+    corners = ([0, ease, 1 - ease, 1], [0, 1 / (1 - ease), 1 / (1 - ease), 0]) if ease else ([0, 1], [1, 1])
+    assert speed == pytest.approx(np.interp(share, *corners), abs=1e-9)
+    summed = np.concatenate([[0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(share))])
+    assert way == pytest.approx(summed, abs=1e-7)
+
+
+def test_an_eased_swing_leaves_the_ground_and_comes_down_at_rest() -> None:
+    step = random_step(np.random.default_rng(0), trigonometric=0.0)
+    for ease, moves in ((0.25, False), (0.0, True)):
+        eased = step._replace(ease=np.asarray(ease))
+        for time in (0.0, float(step.period) - 1e-9):
+            speed = np.abs(planner.command(eased, np.asarray(time)).rates.ankle_velocities).max()
+            assert (speed > 0.1) == moves and (moves or speed < 1e-6)
 
 
 @pytest.mark.parametrize("order", [1, 4, 6])
