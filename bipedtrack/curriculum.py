@@ -80,6 +80,7 @@ class Lesson:
     difficulty: float  # 0 the mildest, 1 the full ranges
     parts: int = 1  # PPO calls that share the steps; a killed run repeats at most one
     push_share: float = 0.0  # share of the episodes with pushes
+    noise: float | None = None  # standard deviation that exploration begins the lesson with; else it goes on as it was
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.parts < 1:
@@ -88,6 +89,8 @@ class Lesson:
             raise ValueError(f"difficulty must lie in [0, 1], not {self.difficulty}")
         if not 0 <= self.push_share <= 1:
             raise ValueError(f"push_share must lie in [0, 1], not {self.push_share}")
+        if self.noise is not None and not self.noise > 0:
+            raise ValueError(f"noise must be positive, not {self.noise}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,6 +178,7 @@ class Call:
     learning_rate: float
     entropy_cost: float
     clipping_epsilon: float
+    noise: float | None  # Lesson.noise, in the first part alone
 
 
 def calls(curriculum: Curriculum) -> tuple[Call, ...]:
@@ -193,7 +197,8 @@ def calls(curriculum: Curriculum) -> tuple[Call, ...]:
             )
             for part in range(lesson.parts):
                 steps = lesson.steps // lesson.parts + (part < lesson.steps % lesson.parts)
-                found.append(Call(len(found), stage, lesson, steps, rate, entropy, epsilon))
+                noise = lesson.noise if part == 0 else None
+                found.append(Call(len(found), stage, lesson, steps, rate, entropy, epsilon, noise))
             done += lesson.steps
     return tuple(found)
 

@@ -123,6 +123,8 @@ def _run_call(
     updates = math.ceil(call.steps / ppo_config.steps_per_update)
     epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
     the_env = make_env(config, call.stage, call.lesson)
+    if params is not None and call.noise is not None:
+        params = _with_noise(params, call.noise)
 
     def report(steps: int, metrics: dict[str, Any]) -> None:
         progress.update(call, steps, _figures(metrics, config.policy_period))
@@ -145,6 +147,13 @@ def _run_call(
             **ppo_arguments(config, call),
         )
     return params
+
+
+def _with_noise(params: Params, noise: float) -> Params:
+    """The parameters with another standard deviation of the actions, the same for all of them."""
+    normalizer, actor, critic = params
+    deviation = jax.tree.map(lambda log: jax.numpy.full_like(log, math.log(noise)), actor["params"]["std_logparam"])
+    return normalizer, {**actor, "params": {**actor["params"], "std_logparam": deviation}}, critic
 
 
 def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[str, Any]:

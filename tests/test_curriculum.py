@@ -102,6 +102,13 @@ def test_calls_share_the_steps_of_their_lessons(tmp_path: pathlib.Path) -> None:
     assert [call.steps for call in made] == [26, 26, 26, 25, 49, 48, 50]
 
 
+def test_a_lesson_may_begin_with_another_noise_in_its_first_part_alone(tmp_path: pathlib.Path) -> None:
+    made = calls(loaded(tmp_path, MINIMAL.replace('name = "long",', 'name = "long", noise = 0.2,')))
+    assert [call.noise for call in made] == [None] * 4 + [0.2] + [None] * 2
+    with pytest.raises(config.ConfigError, match="noise must be positive, not 0"):
+        loaded(tmp_path, MINIMAL.replace('name = "long",', 'name = "long", noise = 0,'))
+
+
 def test_a_lesson_takes_the_value_of_its_middle_on_the_falling_line_of_its_stage(tmp_path: pathlib.Path) -> None:
     made = calls(loaded(tmp_path, MINIMAL))
     # 200 steps in the first stage, 103 of them in its first lesson

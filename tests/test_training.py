@@ -221,6 +221,22 @@ def test_only_a_stage_with_stairs_pays_for_boxes() -> None:
     np.testing.assert_allclose(harder.given.ranges["walk_step"], [step[0], step[2]], atol=1e-7)
 
 
+def test_another_noise_changes_the_spread_of_the_actions_alone() -> None:
+    config = plan()
+    params, made = parameters(config)
+    quiet = training._with_noise(params, 0.2)
+    seen = jax.random.normal(jax.random.PRNGKey(1), (101,))
+    samples, means = [], []
+    for normalizer, actor, _ in (params, quiet):
+        logits = made.policy_network.apply(normalizer, actor, jnp.broadcast_to(seen, (4000, 101)))
+        samples.append(made.parametric_action_distribution.sample(logits, jax.random.PRNGKey(2)))
+        means.append(made.parametric_action_distribution.mode(logits))
+    np.testing.assert_array_equal(*means)
+    np.testing.assert_allclose(samples[1].std(axis=0), 0.2, rtol=0.06)
+    assert (np.asarray(samples[0]).std(axis=0) > 0.3).all()
+    assert same(params[2], quiet[2]) and same(params[0], quiet[0])
+
+
 def test_a_stage_with_rewards_of_its_own_uses_them() -> None:
     config = curriculum.load("smoke")
     own = config.rewards._replace(sharpness=config.rewards.sharpness._replace(trunk_position=77.0))
