@@ -44,6 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bipedtrack import kinematics, planner, rotations
+from bipedtrack.messages import Refusal
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.planner import Command, TaskStep
 from bipedtrack.robot import LEGS, Robot
@@ -66,7 +67,7 @@ _LARGEST = 1e6  # m, rad or s
 _ON_THE_WAY = np.arange(1, 8) / 8  # shares of a step's period at which its targets must be within reach
 
 
-class ScriptError(ValueError):
+class ScriptError(Refusal, ValueError):
     """A script that cannot be walked: for each problem one line with its place and what would be right."""
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from bipedtrack import checkpoint, config, control, kinematics, observation
 from bipedtrack.control import ControlConfig
+from bipedtrack.messages import Refusal
 from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
@@ -23,7 +24,7 @@ KIND = "policy"
 ACTIVATIONS = ("swish", "tanh", "relu")
 
 
-class PolicyError(ValueError):
+class PolicyError(Refusal, ValueError):
     """A policy that does not fit this robot or this version; the message is one line."""
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from bipedtrack import config, paths
+from bipedtrack.messages import Refusal
 
 LEGS = ("left", "right")
 
@@ -74,7 +75,7 @@ class Description:
             raise ValueError(f"feedback_ratio must lie in [0, 2], not {self.feedback_ratio}")
 
 
-class RobotError(ValueError):
+class RobotError(Refusal, ValueError):
     """A robot that cannot be had, in one line that says which are there or what its model lacks."""
 
 

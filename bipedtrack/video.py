@@ -25,7 +25,7 @@ import numpy as np
 import tyro
 
 from bipedtrack import doctor, footsteps, policy, robot, simulate
-from bipedtrack.messages import fail
+from bipedtrack.messages import Refusal, fail
 from bipedtrack.nodes import Nodes
 from bipedtrack.trace import Trace
 
@@ -46,7 +46,7 @@ _SMOOTHING = 1.0  # s of the trunk's path over which the camera averages
 _SAMPLES, _SHADOW_MAP = 4, 1024
 
 
-class VideoError(RuntimeError):
+class VideoError(Refusal, RuntimeError):
     """A film that cannot be made or written; the message is one line."""
 
 

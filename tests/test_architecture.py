@@ -14,7 +14,7 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 
 # A module may import those before it: on a line above, or further left on its own.
 LADDER = """
-    versions paths messages record drawing
+    messages versions paths record drawing
     compilation distributed
     config checkpoint
     rotations robot
