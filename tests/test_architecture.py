@@ -20,7 +20,7 @@ LADDER = """
     rotations robot
     nodes kinematics trace packets
     planner terrain
-    tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
+    feasibility rows tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite
     training evaluation report
@@ -29,7 +29,8 @@ LADDER = """
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
 DEPLOYMENT = (
-    "rotations nodes kinematics planner control observation policy footsteps packets follower robot config checkpoint"
+    "rotations nodes kinematics planner terrain feasibility rows footsteps control observation policy packets follower"
+    " robot config checkpoint"
 ).split()
 ABSENT = ("jax", "flax", "brax", "optax", "mujoco")
 
