@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import reports
 
 from bipedtrack import planner, tasks
 from bipedtrack import robot as robots
@@ -83,3 +84,15 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
         return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
 
     return draw
+
+
+@pytest.fixture(scope="session")
+def whole(robot: robots.Robot) -> dict[str, Any]:
+    """A record of an evaluation, made by hand: two policies on three engines, with robustness."""
+    return reports.make(robot)
+
+
+@pytest.fixture
+def record(whole: dict[str, Any]) -> dict[str, Any]:
+    """The same for a test to change."""
+    return reports.copied(whole)

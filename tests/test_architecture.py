@@ -14,7 +14,7 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 
 # A module may import those before it: on a line above, or further left on its own.
 LADDER = """
-    messages versions paths record drawing
+    messages versions paths record markup drawing
     compilation distributed
     config checkpoint
     rotations robot
@@ -23,7 +23,7 @@ LADDER = """
     feasibility rows tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite
-    training evaluation report
+    training evaluation sheets comparisons report
     doctor train export evaluate simulate video teleop drive realtime scene page play __main__
 """.split()
 
