@@ -1,8 +1,10 @@
 """What many tests share: the robot, its compiled model, the default curriculum. JAX runs on the CPU."""
 
+import concurrent.futures
 import functools
+import multiprocessing
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
@@ -14,8 +16,9 @@ import mujoco
 import numpy as np
 import pytest
 import reports
+from filmed import Rendered
 
-from bipedtrack import planner, tasks
+from bipedtrack import planner, tasks, video
 from bipedtrack import robot as robots
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.curriculum import load as load_curriculum
@@ -96,3 +99,18 @@ def whole(robot: robots.Robot) -> dict[str, Any]:
 def record(whole: dict[str, Any]) -> dict[str, Any]:
     """The same for a test to change."""
     return reports.copied(whole)
+
+
+@pytest.fixture(scope="session")
+def rendered() -> Iterator[Rendered]:
+    """Calls a function of a test's module where mujoco renders; skips where no back end does.
+
+    A process renders with one back end for all its life, so pictures come from a process of their own.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as process:
+        try:
+            assert process.submit(video.choose_backend).result() in ("egl", "osmesa", "glfw", os.environ.get("MUJOCO_GL"))
+        except video.VideoError as error:
+            pytest.skip(str(error))
+        yield lambda function, *arguments: process.submit(function, *arguments).result()

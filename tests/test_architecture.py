@@ -22,7 +22,7 @@ LADDER = """
     planner terrain
     feasibility rows tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
     policy follower onnx_export env autoreset
-    curriculum rollout progress recording suite
+    curriculum rollout progress recording suite pictures
     training evaluation sheets comparisons report
     doctor train export evaluate simulate video teleop drive realtime scene page play __main__
 """.split()
