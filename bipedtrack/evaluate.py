@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, tasks, trace, versions
+from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, swings, tasks, trace, versions
 from bipedtrack.messages import fail, quiet_imports
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class Engines:
         return recording.mjx_recorder(the_env, self._who.act)
 
 
-def boxes_of(batch: suite.Batch) -> metrics.Boxes | None:
+def boxes_of(batch: suite.Batch) -> swings.Boxes | None:
     """The boxes of a batch for the clearance; None where there are none."""
     if not batch.sizes:
         return None
@@ -138,7 +138,7 @@ def boxes_of(batch: suite.Batch) -> metrics.Boxes | None:
     count = poses.shape[1]
     poses = poses.reshape(len(poses), -1, 7)
     half = np.broadcast_to(np.tile(np.array(batch.sizes) / 2, (count, 1)), (len(poses), poses.shape[1], 3))
-    return metrics.Boxes(poses[..., :3], half, 2 * np.arctan2(poses[..., 6], poses[..., 3]))
+    return swings.Boxes(poses[..., :3], half, 2 * np.arctan2(poses[..., 6], poses[..., 3]))
 
 
 def run(options: Evaluate) -> dict[str, Any]:
@@ -231,7 +231,7 @@ def _thin(values: np.ndarray) -> list[float | None]:
     return [None if not np.isfinite(v) else round(float(v), 4) for v in values[_every(len(values))]]
 
 
-def _boxes_of_first(boxes: metrics.Boxes) -> list[list[float]]:
+def _boxes_of_first(boxes: swings.Boxes) -> list[list[float]]:
     """The first episode's boxes: x, y, z of the centre, length, width, height, m, and yaw, rad."""
     return np.column_stack([boxes.centres[0], 2 * boxes.half_sizes[0], boxes.yaws[0]]).round(4).tolist()
 

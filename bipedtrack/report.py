@@ -9,7 +9,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from bipedtrack import comparisons, markup, metrics, sheets, verdicts
+from bipedtrack import comparisons, markup, metrics, sheets, swings, verdicts
 from bipedtrack.markup import escape, section
 from bipedtrack.record import ENGINES, engines_of, get, labels_of, number
 
@@ -132,10 +132,10 @@ that fall; median of all, if half of them fall.</li>
 <li><b>Footholds</b>: the ankle against its foothold at the planned instant, whether the foot is down or not. The time is
 when the ground first bears more than {100 * metrics.CONTACT_SHARE:g} % of the weight, from the middle of the swing to half
 a swing after its planned end; else the touchdown is missed. No error is divided by a step of
-{100 * metrics.LEAST_STEP:g} cm or less.</li>
+{100 * swings.LEAST_STEP:g} cm or less.</li>
 <li><b>Clearance</b>: least height of a corner of the sole over the edge of a tread or obstacle as it passes that edge. A
-swing is against a side if a corner comes within {1000 * metrics.SIDE_REACH:g} mm of it,
-{1000 * metrics.SIDE_DEPTH:g} mm or more below its edge.</li>
+swing is against a side if a corner comes within {1000 * swings.SIDE_REACH:g} mm of it,
+{1000 * swings.SIDE_DEPTH:g} mm or more below its edge.</li>
 <li><b>Rest</b>: from {metrics.SETTLE:g} s after the command came to stand still. Joint speed RMS is over all joints, sway of
 the trunk in the plane about its mean; a foot has moved if it was more than {metrics.FOOT_MOVED_CM:g} cm off where it
 stood.</li>

@@ -19,8 +19,8 @@ LADDER = """
     config checkpoint
     rotations robot
     nodes kinematics trace packets
-    planner terrain
-    feasibility rows tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
+    planner terrain feasibility rows
+    tasks footsteps scripts steering plans disturbances control observation rewards swings metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite pictures
     training evaluation sheets comparisons report
