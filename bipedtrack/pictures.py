@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bipedtrack import robot
+from bipedtrack import robot, swings
 from bipedtrack.nodes import Nodes
 from bipedtrack.trace import Trace
 
@@ -45,14 +45,9 @@ def footholds(recorded: Trace, ankle_height: float) -> list[Foothold]:
     A swing that is not over when the trace ends has no foothold.
     """
     found = []
+    starts, ends = swings.starts_and_ends(recorded.timer[None])
     for foot in range(2):
-        timer = recorded.timer[:, foot]
-        swings = timer > 0
-        # a foot that swings twice in a row has its timer set anew in between
-        breaks = np.diff(timer) > 0.5 * recorded.timestep
-        begins = np.flatnonzero(swings & np.concatenate([[True], ~swings[:-1] | breaks]))
-        ends = np.flatnonzero(swings[:-1] & (~swings[1:] | breaks)) + 1
-        for begin, end in zip(begins, ends, strict=False):
+        for begin, end in zip(*map(np.flatnonzero, (starts[0, :, foot], ends[0, :, foot])), strict=False):
             position = np.array(recorded.target.ankle_positions[end, foot], float) - [0, 0, ankle_height]
             yaw = float(recorded.target.ankle_yaws[end, foot])
             found.append(Foothold(foot, float(recorded.time[begin]), float(recorded.time[end]), position, yaw))
