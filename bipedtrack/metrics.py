@@ -115,7 +115,7 @@ def time_course(trace: Trace) -> dict[str, np.ndarray]:
 
 
 def errors(trace: Trace) -> dict[str, np.ndarray]:
-    """How far each node is off the target of the same instant: (episodes, n) in the unit of each name, nan after a fall."""
+    """How far each node is off the target of the same instant: (..., n) in the unit of each name, nan after a fall."""
     target, real = (Nodes(*(part[trace.alive].astype(float) for part in side)) for side in (trace.target, trace.measured))
     trunk, ankles = target.trunk_position - real.trunk_position, target.ankle_positions - real.ankle_positions
     distances = np.linalg.norm(np.concatenate([trunk[:, None], ankles], axis=1), axis=-1)

@@ -25,7 +25,6 @@ import tyro
 
 from bipedtrack import doctor, footsteps, policy, robot, simulate
 from bipedtrack.messages import Refusal, fail
-from bipedtrack.nodes import Nodes
 from bipedtrack.pictures import COLORS, render
 from bipedtrack.trace import Trace
 
@@ -109,8 +108,7 @@ def film(
 def _until_fall(recorded: Trace, boxes: np.ndarray | None) -> tuple[Trace, np.ndarray | None]:
     """The trace and the boxes without what follows a fall."""
     count = len(recorded.time) if recorded.alive.all() else int(np.argmin(recorded.alive))
-    parts: list[Any] = [Nodes(*(a[:count] for a in part)) if isinstance(part, Nodes) else part[:count] for part in recorded]
-    return Trace(*parts), boxes[:count] if boxes is not None and np.ndim(boxes) == 3 else boxes
+    return recorded.until(count), boxes[:count] if boxes is not None and np.ndim(boxes) == 3 else boxes
 
 
 def require_writable(path: pathlib.Path, size: tuple[int, int] = (640, 480)) -> None:
