@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, swings, tasks, trace, versions
+from bipedtrack.disturbances import LADDERS, UNDISTURBED, Hooks
 from bipedtrack.messages import fail, quiet_imports
 
 if TYPE_CHECKING:
@@ -108,10 +109,10 @@ class Engines:
         self._mujoco = recording.mujoco_recorder(controls)
         self._mjx: dict[Any, Any] = {}
 
-    def record(self, name: str, batch: suite.Batch, seconds: float, **hooks: Any) -> trace.Trace:
+    def record(self, name: str, batch: suite.Batch, seconds: float, hooks: Hooks = UNDISTURBED) -> trace.Trace:
         """The trace of a batch in one engine."""
         if name != "mjx":
-            return self._mujoco(batch.plan, batch.sizes, seconds, name == "converged", **hooks)
+            return self._mujoco(batch.plan, batch.sizes, seconds, name == "converged", hooks)
         if batch.sizes not in self._mjx:
             self._mjx[batch.sizes] = self._compile(batch)
         return self._mjx[batch.sizes](batch.plan, seconds)
@@ -248,16 +249,15 @@ def _path(recorded: trace.Trace) -> dict[str, Any]:
 
 def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float) -> dict[str, Any]:
     """Survival and ankle error while walking forward, over the levels of every disturbance."""
-    from bipedtrack import disturbances, suite
+    from bipedtrack import suite
 
     episodes = min(options.episodes, 64)
     batch = suite.batch("walk-forward", tasks.Ranges(), who.robot, episodes, options.seconds, options.seed)
     found: dict[str, Any] = {}
-    for name, ladder in disturbances.LADDERS.items():
+    for name, ladder in LADDERS.items():
         rows = []
         for level in ladder.levels:
-            hooks = ladder.hooks(level, who.robot.timestep)._asdict()
-            recorded = engines.record("mujoco", batch, options.seconds, **hooks)
+            recorded = engines.record("mujoco", batch, options.seconds, ladder.hooks(level, who.robot.timestep))
             summary = metrics.summarise(recorded, who.robot, weight)
             rows.append({"level": level, "survival": summary["survival"], "errors": summary["errors"]})
             print(f"{name} {level:g} {ladder.unit}: {100 * summary['survival']['share']:.0f} % without a fall", flush=True)

@@ -26,6 +26,7 @@ from bipedtrack import (
     terrain,
 )
 from bipedtrack import robot as robots
+from bipedtrack.disturbances import Hooks
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.trace import Trace
 
@@ -119,7 +120,7 @@ def in_c(recorders: Recorders, plan: plans.Plan) -> InC:
         forces.append([data.actuator_force.copy() for data in datas])
         return targets
 
-    trace = recorders.mujoco(plan, SIZES, SECONDS, before_step=look)
+    trace = recorders.mujoco(plan, SIZES, SECONDS, hooks=Hooks(before_step=look))
     return InC(trace, np.array(forces[1:]).swapaxes(0, 1))
 
 
@@ -315,7 +316,9 @@ def test_when_all_have_fallen_the_trace_keeps_its_length(
         return targets
 
     mjx = engine == "mjx"
-    fallen = recorders.mjx(rolled, SECONDS) if mjx else recorders.mujoco(rolled, SIZES, SECONDS, before_step=count)
+    fallen = (
+        recorders.mjx(rolled, SECONDS) if mjx else recorders.mujoco(rolled, SIZES, SECONDS, hooks=Hooks(before_step=count))
+    )
     assert len(recorders.compiled) == compiled  # for the first plan, but not anew
     # MJX looks every second, C at every step
     stopped = 200 if mjx else len(ticks)
@@ -432,8 +435,8 @@ def test_hooks_act(first: policy.Policy, plan: plans.Plan) -> None:
         qpos[:, 7:] = 0.01 * tick
         return qpos, qvel
 
-    hooks = {"model_of": model_of, "before_step": before_step, "observed": observed}
-    found = recording.mujoco_recorder(controls)(some, SIZES, 0.2, converged=True, **hooks)
+    hooks = Hooks(model_of, before_step, observed)
+    found = recording.mujoco_recorder(controls)(some, SIZES, 0.2, converged=True, hooks=hooks)
     assert ticks == [(name, tick) for tick in range(40) for name in ("observed", "before_step")]
     # each episode has its own model, of which MuJoCo has derived what follows from the masses
     assert len({id(model) for model in models}) == 3
