@@ -6,7 +6,7 @@ import itertools
 import math
 import pathlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -28,16 +28,13 @@ Draw = Callable[..., Batch]
 
 
 @pytest.fixture(scope="module")
-def draw(robot: Robot) -> Iterator[Draw]:
-    """Draws a task's batch: draw(name, episodes=18, seconds=72, seed=7, **ranges). Compiles in half the time."""
+def draw(robot: Robot, unoptimised: None) -> Draw:
+    """Draws a task's batch: draw(name, episodes=18, seconds=72, seed=7, **ranges)."""
 
     def draw(name: str, episodes: int = EPISODES, seconds: float = LONGEST, seed: int = SEED, **ranges: tuple) -> Batch:
         return suite.batch(name, tasks.Ranges()._replace(**ranges), robot, episodes, seconds, seed)
 
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield draw
-    jax.config.update("jax_disable_most_optimizations", before)
+    return draw
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,9 @@
-"""What the tests of metrics share: robots that stand on their targets, which a test then moves, and their figures."""
+"""What the tests of traces share: robots that stand on their targets, for a test to move; figures; MuJoCo's own nodes."""
 
+import math
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from bipedtrack import metrics
@@ -52,3 +54,16 @@ def swing(trace: Trace, liftoff: int, touchdown: int, foot: int = 0, episode: in
 
 def summary(trace: Trace, robot: Robot, **options: Any) -> dict[str, Any]:
     return metrics.summarise(trace, robot, WEIGHT, **options)
+
+
+def by_mujoco(model: mujoco.MjModel, states: np.ndarray) -> Nodes:
+    """The nodes at qpos (n, 19) by MuJoCo's own kinematics."""
+    data, found = mujoco.MjData(model), []
+    feet = [data.body(name) for name in ("left_foot", "right_foot")]
+    for qpos in states:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        yaws = [math.atan2(foot.xmat[3], foot.xmat[0]) for foot in feet]
+        trunk = data.body("trunk")
+        found.append((trunk.xpos.copy(), trunk.xquat.copy(), [foot.xpos.copy() for foot in feet], yaws))
+    return Nodes(*map(np.array, zip(*found, strict=True)))
