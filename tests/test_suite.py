@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from bipedtrack import planner, plans, suite, tasks
+from bipedtrack import planner, plans, scripts, suite, tasks
 from bipedtrack.robot import Robot
 from bipedtrack.suite import Batch, Level
 
@@ -375,7 +375,7 @@ def written(path: pathlib.Path) -> tuple[list[dict[str, str]], list[list[float]]
 
 @pytest.mark.parametrize("name", ["obstacles", "composite"])
 def test_a_script_is_the_same_in_every_episode_and_as_it_is_written(name: str, robot: Robot) -> None:
-    rows, boxes = written(suite.script_path(name))
+    rows, boxes = written(scripts.ready()[name])
     batch = suite.batch(name, tasks.Ranges(), robot, 3, 10.0, SEED)
     steps = batch.plan.steps
     assert steps.period.shape == (3, len(rows) + 1)  # and at last the end is held
