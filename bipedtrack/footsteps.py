@@ -21,9 +21,9 @@ defaults. What the cells mean and what empty ones do:
     trunk_yaw                empty: the mean of the feet's yaws
 
 With `both`, x, y, z, yaw and lift stay empty and the period is how long the trunk takes. A foot that is up needs its z, and
-the other one can not step until it is down again. A line with nothing
-but `both` and perhaps a period holds: every target stays where it is. So does everything after the last line.
-A yaw counts modulo a whole turn; feet and trunk turn the shorter way.
+the other one can not step until it is down again. A line with nothing but `both` and perhaps a period holds: every target
+stays where it is. So does everything after the last line. A yaw counts modulo a whole turn; feet and trunk turn the shorter
+way.
 
 Lines that begin with # are comments, but `# box x y z yaw length width height` puts a box on the ground,
 wherever in the file it stands: (x, y, z) is the middle of its bottom face, so its top is at z + height.
