@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from bipedtrack import drawing
+import numpy as np
+
+from bipedtrack import drawing, terrain
 from bipedtrack.record import Run, get, greatest_of, labels_of, mean_of, number, percent, runs_of
 from bipedtrack.robot import LEGS
 from bipedtrack.verdicts import Quantity
@@ -106,9 +107,7 @@ def _ends(paths: dict[str, Any]) -> str:
 def _outline(box: list[float], along: int | None) -> list[tuple[float, float]]:
     """The corners of a box seen from above; or, above the ground, from the side with axis `along` to the right."""
     x, y, z, length, width, height, yaw = box
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    corners = [(s * length / 2, t * width / 2) for s, t in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-    flat = [(x + cosine * u - sine * v, y + sine * u + cosine * v) for u, v in corners]
+    flat = [(u, v) for u, v in terrain.rectangle(np.array([x, y]), yaw, length, width).tolist()]
     if along is None:
         return flat
     places, bottom, top = [corner[along] for corner in flat], max(z - height / 2, 0.0), z + height / 2

@@ -29,6 +29,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bipedtrack.messages import Refusal
+
 FORMAT = "bipedtrack"
 FORMAT_VERSION = 1
 KEPT_CHECKPOINTS = 3
@@ -39,11 +41,11 @@ _UNFINISHED = ".unfinished"  # suffix of files being written
 _DTYPE_KINDS = "biufc"  # booleans and numbers: never objects, which would be pickle
 
 
-class CheckpointError(ValueError):
+class CheckpointError(Refusal, ValueError):
     """An array file that is damaged, foreign or of another kind; the message is one line."""
 
 
-class RunError(RuntimeError):
+class RunError(Refusal, RuntimeError):
     """A run directory that cannot be used, or a file that cannot be written; the message is one line."""
 
 

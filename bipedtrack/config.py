@@ -20,10 +20,12 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NoReturn, TypeVar
 
+from bipedtrack.messages import Refusal
+
 T = TypeVar("T")
 
 
-class ConfigError(ValueError):
+class ConfigError(Refusal, ValueError):
     """A configuration that does not fit its classes; the message is one line."""
 
 

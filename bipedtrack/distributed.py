@@ -16,11 +16,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from bipedtrack.messages import Refusal
+
 _PATIENCE = 60  # s that a process waits for the others at the start
 _HEARTBEAT = 30  # s after which a machine that says nothing counts as lost
 
 
-class DistributedError(RuntimeError):
+class DistributedError(Refusal, RuntimeError):
     """Processes that cannot train together; the message is one line."""
 
 

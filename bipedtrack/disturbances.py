@@ -18,11 +18,17 @@ NOISE = {"joint angles": 0.01, "trunk tilt": 0.01, "trunk velocity": 0.05, "angu
 
 
 class Hooks(NamedTuple):
-    """Arguments of a `recording.mujoco_recorder`."""
+    """Where a `recording.mujoco_recorder` lets its e robots be disturbed."""
 
+    # (model, episode) -> the model of that episode, for changed masses, friction or motors
     model_of: Callable[[Any, int], Any] | None = None
+    # (tick, datas, joint targets (e, 12)) -> joint targets, for pushes and delays
     before_step: Callable[[int, Sequence[Any], np.ndarray], np.ndarray] | None = None
+    # (tick, qpos, qvel) -> what the controller is told of them, for noise
     observed: Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+
+
+UNDISTURBED = Hooks()
 
 
 class Ladder(NamedTuple):

@@ -174,19 +174,13 @@ class TrackingEnv(brax.envs.Env):
             push_left=jnp.int32(0),
         )
         zero = jnp.float32(0)
-        names = [
-            *rewards.Terms._fields,
-            "ankle_error_cm",
-            "ankle_yaw_error_deg",
-            "trunk_error_cm",
-            "trunk_error_deg",
-        ]
+        names = *rewards.Terms._fields, *tasks.ERRORS, "fell", "nonfinite"
         return brax.envs.State(
             pipeline_state=physics,
             obs=self.observe(physics, episode, self.command(episode)),
             reward=zero,
             done=zero,
-            metrics=dict.fromkeys([*names, "fell", "nonfinite"], zero),
+            metrics=dict.fromkeys(names, zero),
             info={"episode": episode},
         )
 

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, tasks, trace, versions
+from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, scripts, tasks, trace, versions
+from bipedtrack.disturbances import LADDERS, UNDISTURBED, Hooks
 from bipedtrack.messages import fail, quiet_imports
+from bipedtrack.swings import Boxes
 
 if TYPE_CHECKING:
     from bipedtrack import suite
@@ -108,10 +110,10 @@ class Engines:
         self._mujoco = recording.mujoco_recorder(controls)
         self._mjx: dict[Any, Any] = {}
 
-    def record(self, name: str, batch: suite.Batch, seconds: float, **hooks: Any) -> trace.Trace:
+    def record(self, name: str, batch: suite.Batch, seconds: float, hooks: Hooks = UNDISTURBED) -> trace.Trace:
         """The trace of a batch in one engine."""
         if name != "mjx":
-            return self._mujoco(batch.plan, batch.sizes, seconds, name == "converged", **hooks)
+            return self._mujoco(batch.plan, batch.sizes, seconds, name == "converged", hooks)
         if batch.sizes not in self._mjx:
             self._mjx[batch.sizes] = self._compile(batch)
         return self._mjx[batch.sizes](batch.plan, seconds)
@@ -128,7 +130,7 @@ class Engines:
         return recording.mjx_recorder(the_env, self._who.act)
 
 
-def boxes_of(batch: suite.Batch) -> metrics.Boxes | None:
+def boxes_of(batch: suite.Batch) -> Boxes | None:
     """The boxes of a batch for the clearance; None where there are none."""
     if not batch.sizes:
         return None
@@ -138,7 +140,7 @@ def boxes_of(batch: suite.Batch) -> metrics.Boxes | None:
     count = poses.shape[1]
     poses = poses.reshape(len(poses), -1, 7)
     half = np.broadcast_to(np.tile(np.array(batch.sizes) / 2, (count, 1)), (len(poses), poses.shape[1], 3))
-    return metrics.Boxes(poses[..., :3], half, 2 * np.arctan2(poses[..., 6], poses[..., 3]))
+    return Boxes(poses[..., :3], half, 2 * np.arctan2(poses[..., 6], poses[..., 3]))
 
 
 def run(options: Evaluate) -> dict[str, Any]:
@@ -199,7 +201,7 @@ def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.
     from bipedtrack import suite
 
     if options.script is not None or name in suite.SCRIPTS:
-        path = options.script or suite.script_path(name)
+        path = options.script or scripts.ready()[name]
         script = footsteps.load(path, the_robot)
         # a script is the same every time: more episodes would tell nothing
         return suite.script_batch(script, 1), footsteps.duration(script)
@@ -231,7 +233,7 @@ def _thin(values: np.ndarray) -> list[float | None]:
     return [None if not np.isfinite(v) else round(float(v), 4) for v in values[_every(len(values))]]
 
 
-def _boxes_of_first(boxes: metrics.Boxes) -> list[list[float]]:
+def _boxes_of_first(boxes: Boxes) -> list[list[float]]:
     """The first episode's boxes: x, y, z of the centre, length, width, height, m, and yaw, rad."""
     return np.column_stack([boxes.centres[0], 2 * boxes.half_sizes[0], boxes.yaws[0]]).round(4).tolist()
 
@@ -248,16 +250,15 @@ def _path(recorded: trace.Trace) -> dict[str, Any]:
 
 def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float) -> dict[str, Any]:
     """Survival and ankle error while walking forward, over the levels of every disturbance."""
-    from bipedtrack import disturbances, suite
+    from bipedtrack import suite
 
     episodes = min(options.episodes, 64)
     batch = suite.batch("walk-forward", tasks.Ranges(), who.robot, episodes, options.seconds, options.seed)
     found: dict[str, Any] = {}
-    for name, ladder in disturbances.LADDERS.items():
+    for name, ladder in LADDERS.items():
         rows = []
         for level in ladder.levels:
-            hooks = ladder.hooks(level, who.robot.timestep)._asdict()
-            recorded = engines.record("mujoco", batch, options.seconds, **hooks)
+            recorded = engines.record("mujoco", batch, options.seconds, ladder.hooks(level, who.robot.timestep))
             summary = metrics.summarise(recorded, who.robot, weight)
             rows.append({"level": level, "survival": summary["survival"], "errors": summary["errors"]})
             print(f"{name} {level:g} {ladder.unit}: {100 * summary['survival']['share']:.0f} % without a fall", flush=True)

@@ -12,8 +12,8 @@ from typing import Annotated
 
 import tyro
 
-from bipedtrack import checkpoint, config, onnx_export, policy, robot, versions
-from bipedtrack.messages import fail, quiet_imports
+from bipedtrack import checkpoint, onnx_export, policy, versions
+from bipedtrack.messages import Refusal, fail, quiet_imports
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,15 +45,7 @@ def main() -> None:
         if options.onnx is not None:
             onnx_export.save(written, options.onnx)
             print(options.onnx)
-    except (
-        versions.VersionError,
-        config.ConfigError,
-        robot.RobotError,
-        policy.PolicyError,
-        checkpoint.RunError,
-        checkpoint.CheckpointError,
-        onnx_export.OnnxError,
-    ) as error:
+    except Refusal as error:
         fail(str(error))
 
 

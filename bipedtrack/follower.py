@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bipedtrack import footsteps, kinematics, planner, rotations
+from bipedtrack import footsteps, kinematics, planner, rotations, terrain
 from bipedtrack.nodes import NodeRates, Nodes, ankles_in_trunk_frame
 from bipedtrack.packets import FASTEST, Packet, Refused, speed
 from bipedtrack.planner import Command, TaskStep
@@ -62,7 +62,7 @@ class Follower:
     >>> command = follower.advance()
     """
 
-    def __init__(self, robot: Robot, start: Nodes, boxes: Sequence[footsteps.Box] = (), hold: float = HOLD):
+    def __init__(self, robot: Robot, start: Nodes, boxes: Sequence[terrain.Box] = (), hold: float = HOLD):
         """Stands at `start`; boxes: what stands on the ground; hold: s without packets until it goes back to standing."""
         self.robot = robot
         self.boxes = tuple(boxes)
@@ -158,7 +158,7 @@ class Follower:
 
     def _footing(self, nodes: Nodes) -> np.ndarray:
         """The heights (2,), m, of ankles whose feet stand on the ground under them."""
-        return np.array([footsteps.ground(self.boxes, x, y) for x, y, _ in nodes.ankle_positions]) + self.robot.ankle_height
+        return np.array([terrain.ground(self.boxes, x, y) for x, y, _ in nodes.ankle_positions]) + self.robot.ankle_height
 
     def _check_jump(self, name: str, nodes: Nodes, factor: float = 1.0) -> None:
         """Raises Refused where nodes are too far from where the targets are."""

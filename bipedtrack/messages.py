@@ -6,6 +6,10 @@ import sys
 from typing import NoReturn
 
 
+class Refusal(Exception):
+    """What was asked for cannot be; the message says what is wrong and what was wanted."""
+
+
 def quiet_imports() -> contextlib.redirect_stdout[io.StringIO]:
     """A context for imports: mjx prints in its first one that its optional warp is missing."""
     return contextlib.redirect_stdout(io.StringIO())

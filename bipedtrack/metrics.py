@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bipedtrack import rotations
+from bipedtrack import rotations, swings
 from bipedtrack.nodes import Nodes
 from bipedtrack.robot import Robot
 from bipedtrack.trace import Trace
@@ -20,10 +20,7 @@ from bipedtrack.trace import Trace
 CONTACT_SHARE = 0.05  # of the body weight: a foot that bears more stands
 SETTLE = 1.0  # s after which a command that stands still is a rest
 SATURATION = 0.98  # share of its limit from which a torque counts as saturated
-LEAST_STEP = 0.02  # m: no error is divided by a shorter step
 FOOT_MOVED_CM = 1.0  # by which a foot at rest may be off the place where it stood
-SIDE_REACH = 0.012  # m: a sole touches with spheres of 0.01 m at its corners, so this near to a side they lie against it
-SIDE_DEPTH = 0.005  # m below the edge from which it is the side that is touched, not the top
 _Z = statistics.NormalDist().inv_cdf(0.975)  # of a 95 % interval
 _ANGLES = np.radians(np.arange(0, 180, 15))
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # (2, 12), along which a horizontal extent is taken
@@ -33,23 +30,6 @@ ERRORS = (
     *("trunk_orientation_deg", "left_ankle_yaw_deg", "right_ankle_yaw_deg"),
 )
 Statistics = dict[str, float | None]
-
-
-class Boxes(NamedTuple):
-    """The boxes of each episode, upright and where they stay; those with their top at 0 or below count as not there."""
-
-    centres: np.ndarray  # (episodes, b, 3) m
-    half_sizes: np.ndarray  # (episodes, b, 3) m
-    yaws: np.ndarray  # (episodes, b) rad
-
-
-class Swings(NamedTuple):
-    """The k planned swings that came to their planned end before any fall, as indices into a trace."""
-
-    episode: np.ndarray  # (k,)
-    foot: np.ndarray  # (k,) 0 left, 1 right
-    liftoff: np.ndarray  # (k,) first entry with a timer; its target is where the foot stood
-    touchdown: np.ndarray  # (k,) entry after the last one with a timer; its target is the foothold
 
 
 class Motion(NamedTuple):
@@ -67,7 +47,7 @@ def summarise(
     trace: Trace,
     robot: Robot,
     weight: float,
-    boxes: Boxes | None = None,
+    boxes: swings.Boxes | None = None,
     contact_share: float = CONTACT_SHARE,
     settle: float = SETTLE,
 ) -> dict[str, Any]:
@@ -81,8 +61,8 @@ def summarise(
     - touchdown: planned (how many), undecided (not detected, the trace ends too soon; left out of missed_share),
       missed_share; statistics step_length_cm, foothold_cm (in the plane), height_cm (positive: too high), yaw_deg, time_s
       (negative: early), and for steps of more than 2 cm foothold_per_step, height_per_step (absolute), yaw_deg_per_m.
-    - clearance (None without boxes), see `clearances`: swings (that pass an edge), statistics edge_cm, below_edge_share of
-      them; side_contact_share of all swings.
+    - clearance (None without boxes), see `swings.clearances`: swings (that pass an edge), statistics edge_cm,
+      below_edge_share of them; side_contact_share of all swings.
     - survival: share without a fall, its 95 % interval share_low, share_high (Wilson), falls, time_to_fall_mean_s of the
       fallen, time_to_fall_median_s of all (None: fewer than half fell).
     - rest: episodes with one, windows, seconds of them; statistics over windows of the fields of `Motion`;
@@ -135,7 +115,7 @@ def time_course(trace: Trace) -> dict[str, np.ndarray]:
 
 
 def errors(trace: Trace) -> dict[str, np.ndarray]:
-    """How far each node is off the target of the same instant: (episodes, n) in the unit of each name, nan after a fall."""
+    """How far each node is off the target of the same instant: (..., n) in the unit of each name, nan after a fall."""
     target, real = (Nodes(*(part[trace.alive].astype(float) for part in side)) for side in (trace.target, trace.measured))
     trunk, ankles = target.trunk_position - real.trunk_position, target.ankle_positions - real.ankle_positions
     distances = np.linalg.norm(np.concatenate([trunk[:, None], ankles], axis=1), axis=-1)
@@ -144,110 +124,6 @@ def errors(trace: Trace) -> dict[str, np.ndarray]:
     found = np.full((*trace.alive.shape, len(ERRORS)), np.nan)
     found[trace.alive] = np.column_stack([100 * distances, np.degrees(turn), np.degrees(yaws)])
     return dict(zip(ERRORS, np.moveaxis(found, -1, 0), strict=True))
-
-
-def swings(trace: Trace) -> Swings:
-    """The planned swings, by the timer: one ends where a foot's timer reaches 0 or starts anew."""
-    starts, ends = _planned(trace.timer)
-    n = len(trace.time)
-    begun = np.maximum.accumulate(np.where(starts, np.arange(n)[:, None], 0), axis=1)
-    episode, touchdown, foot = np.nonzero(ends & trace.alive[..., None])
-    return Swings(episode, foot, begun[episode, touchdown - 1, foot], touchdown)
-
-
-def detect(trace: Trace, planned: Swings, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """The measured touchdown of each planned swing, (k,) index or -1, and whether there was time to see it, (k,) bool.
-
-    It is the first entry with more than `threshold` N on the foot after one with no more during the planned swing. It is
-    sought from the middle of the swing, so that a toe that drags at lift-off is none, until half a swing's time after the
-    planned touchdown: the middle of a following step as long as this one. A foot that comes down before the middle of its
-    swing and stays there counts from that middle. A foot that is never unloaded touches nothing down.
-    """
-    n = len(trace.time)
-    half = (planned.touchdown - planned.liftoff) // 2
-    last = planned.touchdown + half
-    width = int((last - planned.liftoff).max(initial=0)) + 1
-    index = planned.liftoff[:, None] + np.arange(width)
-    episode, foot, inside = planned.episode[:, None], planned.foot[:, None], np.minimum(index, n - 1)
-    known = (index <= np.minimum(last, n - 1)[:, None]) & trace.alive[episode, inside]
-    loaded = known & (trace.foot_forces[episode, inside, foot] > threshold)
-    unloaded = known & ~loaded & (index < planned.touchdown[:, None])
-    hit = loaded & np.logical_or.accumulate(unloaded, axis=1) & (index >= (planned.liftoff + half)[:, None])
-    found = np.where(hit.any(axis=1), planned.liftoff + hit.argmax(axis=1), -1)
-    return found, (found >= 0) | (last < n) | ~trace.alive[planned.episode, -1]
-
-
-def touchdowns(trace: Trace, threshold: float) -> dict[str, np.ndarray]:
-    """What came of k planned touchdowns, (k,) each, with the ground felt from a normal force of more than `threshold` N.
-
-    Errors are those at the planned instant, whether the foot was down or not. Keys as in `summarise` and step_length_cm,
-    in the plane between the targets at lift-off and touchdown; values per step length are nan for steps of 2 cm and less,
-    time_s is nan where nothing was detected; missed is 1 or 0, and nan where the trace ends too soon to say.
-    """
-    planned = swings(trace)
-    measured, decided = detect(trace, planned, threshold)
-    at = planned.episode, planned.touchdown, planned.foot
-    target, real = trace.target.ankle_positions[at].astype(float), trace.measured.ankle_positions[at].astype(float)
-    start = trace.target.ankle_positions[planned.episode, planned.liftoff, planned.foot]
-    foothold, height = np.linalg.norm((real - target)[:, :2], axis=-1), (real - target)[:, 2]
-    yaw = np.degrees(np.abs(rotations.wrap(trace.measured.ankle_yaws[at] - trace.target.ankle_yaws[at])))
-    length = np.linalg.norm((target - start)[:, :2], axis=-1)
-    divisor = np.where(length > LEAST_STEP, length, np.nan)
-    return {
-        "step_length_cm": 100 * length,
-        "foothold_cm": 100 * foothold,
-        "height_cm": 100 * height,
-        "yaw_deg": yaw,
-        "foothold_per_step": foothold / divisor,
-        "height_per_step": np.abs(height) / divisor,
-        "yaw_deg_per_m": yaw / divisor,
-        "time_s": np.where(measured >= 0, trace.time[measured] - trace.time[planned.touchdown], np.nan),
-        "missed": np.where(decided, measured < 0, np.nan),
-    }
-
-
-def clearances(trace: Trace, robot: Robot, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
-    """For each planned swing, also one that a fall cuts short, how it cleared the boxes: (k,) m and (k,) bool.
-
-    The first is the least height of a corner of the sole above the top of a box at the moment when that corner passes over
-    the upper edge of the box, in or out, interpolated between entries; nan where it passes none. The second says whether a
-    corner came against the side of a box, 12 mm or nearer and 5 mm or more below its edge: a foot that is stopped there
-    passes no edge and has no clearance. The corners follow the foot with its pitch and roll, by the joint angles; what
-    lies between them is not looked at, for it touches nothing in the simulation either.
-    """
-    starts, _ = _planned(trace.timer)
-    # in the order of episode, foot, time, so that a swing's entries follow one another
-    number = np.cumsum(starts.swapaxes(1, 2)).reshape(len(starts), 2, -1) - 1
-    episode, foot, index = np.nonzero((trace.timer > 0).swapaxes(1, 2) & trace.alive[:, None, :])
-    number = number[episode, foot, index]
-    kept, number = np.unique(number, return_inverse=True)
-    corners = sole_corners(robot, trace.qpos[episode, index], trace.measured.ankle_positions[episode, index, foot], foot)
-    same = (number[1:] == number[:-1])[:, None]
-    least, against = np.full(len(kept), np.inf), np.zeros(len(kept), bool)
-    for i in range(boxes.yaws.shape[1]):
-        centre, half = boxes.centres[episode, i], boxes.half_sizes[episode, i]
-        outside, above = _beside(corners, centre, half, boxes.yaws[episode, i])
-        there = (centre[:, 2] + half[:, 2] > 0)[:, None]
-        passes = same & there[1:] & ((outside[1:] > 0) != (outside[:-1] > 0))
-        share = outside[:-1][passes] / (outside[:-1] - outside[1:])[passes]
-        height = above[:-1][passes] + share * (above[1:] - above[:-1])[passes]
-        np.minimum.at(least, number[1:][np.nonzero(passes)[0]], height)
-        beside = (above <= -SIDE_DEPTH) & (np.abs(outside) <= SIDE_REACH)
-        against[number[beside.any(axis=-1)]] = True
-    return np.where(np.isinf(least), np.nan, least), against
-
-
-def sole_corners(robot: Robot, qpos: np.ndarray, ankles: np.ndarray, foot: np.ndarray) -> np.ndarray:
-    """The corners (k, 4, 3), m, in the world, of the soles of feet (k,) of robots at qpos (k, 19) with ankles (k, 3), m."""
-    states = qpos.T.astype(float)
-    yaw, roll, *pitches, ankle_roll = states[7:].reshape(2, 6, -1)[foot, :, np.arange(len(foot))].T
-    level = np.zeros_like(yaw)
-    hip, rest = rotations.from_euler(roll, level, yaw), rotations.from_euler(ankle_roll, sum(pitches), level)
-    orientation = rotations.multiply(rotations.multiply(states[3:7], hip), rest)[..., None]
-    length, width = robot.sole / 2
-    corners = np.array([[0, x, y, -robot.ankle_height] for x in (length, -length) for y in (width, -width)]).T[:, None]
-    turned = rotations.multiply(rotations.multiply(orientation, corners), rotations.conjugate(orientation))
-    return ankles[:, None] + np.moveaxis(turned[1:], 0, -1)
 
 
 def survival(trace: Trace) -> Statistics:
@@ -327,15 +203,15 @@ def _check(trace: Trace) -> None:
 
 
 def _summarise_touchdowns(trace: Trace, threshold: float) -> dict[str, Any]:
-    found = touchdowns(trace, threshold)
+    found = swings.touchdowns(trace, threshold)
     missed = found.pop("missed")
     summary: dict[str, Any] = {name: _statistics(values) for name, values in found.items()}
     undecided = int(np.isnan(missed).sum())
     return {"planned": len(missed), "undecided": undecided, "missed_share": _statistics(missed)["mean"], **summary}
 
 
-def _summarise_clearances(trace: Trace, robot: Robot, boxes: Boxes) -> dict[str, Any]:
-    edge, against = clearances(trace, robot, boxes)
+def _summarise_clearances(trace: Trace, robot: Robot, boxes: swings.Boxes) -> dict[str, Any]:
+    edge, against = swings.clearances(trace, robot, boxes)
     passed = edge[~np.isnan(edge)]
     return {
         "swings": len(passed),
@@ -358,21 +234,6 @@ def _motion(trace: Trace, episode: int, window: slice) -> Motion:
         trunk_turn_peak_to_peak_deg=float(np.ptp(turn, axis=0).max()),
         foot_motion_cm=100 * float(moved.max()),
     )
-
-
-def _planned(timer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where swings start and end, each (episodes, n, 2) bool; the timer only falls during a swing."""
-    before = np.concatenate([np.zeros_like(timer[:, :1]), timer[:, :-1]], axis=1)
-    starts = timer > before
-    return starts, (before > 0) & (starts | ~(timer > 0))
-
-
-def _beside(points: np.ndarray, centre: np.ndarray, half: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far points (k, p, 3) lie outside the outline of box k, negative within, and above its top: (k, p) m each."""
-    x, y, z = np.moveaxis(points - centre[:, None], -1, 0)
-    cosine, sine = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    along, across = np.abs(cosine * x + sine * y), np.abs(cosine * y - sine * x)
-    return np.maximum(along - half[:, :1], across - half[:, 1:2]), z - half[:, 2:]
 
 
 def _turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bipedtrack import __version__, checkpoint, config, observation
+from bipedtrack.messages import Refusal
 from bipedtrack.policy import Policy
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 OPSET, IR_VERSION = 17, 8
 
 
-class OnnxError(RuntimeError):
+class OnnxError(Refusal, RuntimeError):
     """The onnx package is missing; the message is one line that says how to get it."""
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from bipedtrack import checkpoint, config, control, kinematics, observation
 from bipedtrack.control import ControlConfig
+from bipedtrack.messages import Refusal
 from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
@@ -23,7 +24,7 @@ KIND = "policy"
 ACTIVATIONS = ("swish", "tanh", "relu")
 
 
-class PolicyError(ValueError):
+class PolicyError(Refusal, ValueError):
     """A policy that does not fit this robot or this version; the message is one line."""
 
 
@@ -103,30 +104,7 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
     path = path / "policy.npz" if path.is_dir() else path
     arrays, meta = checkpoint.load_arrays(path, KIND)
     try:
-        if meta["observation"]["hash"] != observation.layout_hash():
-            raise PolicyError("was trained on another observation layout; train or export it with this version")
-        robot_meta = dict(meta["robot"]) | {k[6:]: v for k, v in arrays.items() if k.startswith("robot/")}
-        robot_meta["joint_names"] = tuple(robot_meta["joint_names"])
-        layers = len({name.split("/")[1] for name in arrays if name.startswith("actor/")})
-        known = {"normalizer/mean", "normalizer/std", *(f"robot/{name}" for name in ROBOT_SHAPES)}
-        known |= {f"actor/{i}/{part}" for i in range(layers) for part in ("weight", "bias")}
-        for missing in sorted(known - set(arrays)):
-            raise PolicyError(f"lacks the array {missing}")
-        for stray in sorted(set(arrays) - known):
-            raise PolicyError(f"holds an array {stray}, which no policy has")
-        policy = Policy(
-            network=Network(
-                mean=arrays["normalizer/mean"],
-                std=arrays["normalizer/std"],
-                weights=tuple(arrays[f"actor/{i}/weight"] for i in range(layers)),
-                biases=tuple(arrays[f"actor/{i}/bias"] for i in range(layers)),
-            ),
-            activation=meta["activation"],
-            settings=config.from_dict(ControlConfig, meta["control"], "control"),
-            policy_period=float(meta["policy_period"]),
-            robot=Robot(**robot_meta),
-            provenance=meta["provenance"],
-        )
+        policy = _assembled(arrays, meta)
         _check(policy)
         if robot is not None:
             _check_robot(policy.robot, robot)
@@ -135,6 +113,34 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise PolicyError(f"{path}: is no complete policy ({type(error).__name__}: {error})") from None
     return policy
+
+
+def _assembled(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Policy:
+    """The policy of a file's arrays and meta. Raises PolicyError, or whatever meets a part that is not as it should be."""
+    if meta["observation"]["hash"] != observation.layout_hash():
+        raise PolicyError("was trained on another observation layout; train or export it with this version")
+    robot_meta = dict(meta["robot"]) | {k[6:]: v for k, v in arrays.items() if k.startswith("robot/")}
+    robot_meta["joint_names"] = tuple(robot_meta["joint_names"])
+    layers = len({name.split("/")[1] for name in arrays if name.startswith("actor/")})
+    known = {"normalizer/mean", "normalizer/std", *(f"robot/{name}" for name in ROBOT_SHAPES)}
+    known |= {f"actor/{i}/{part}" for i in range(layers) for part in ("weight", "bias")}
+    for missing in sorted(known - set(arrays)):
+        raise PolicyError(f"lacks the array {missing}")
+    for stray in sorted(set(arrays) - known):
+        raise PolicyError(f"holds an array {stray}, which no policy has")
+    return Policy(
+        network=Network(
+            mean=arrays["normalizer/mean"],
+            std=arrays["normalizer/std"],
+            weights=tuple(arrays[f"actor/{i}/weight"] for i in range(layers)),
+            biases=tuple(arrays[f"actor/{i}/bias"] for i in range(layers)),
+        ),
+        activation=meta["activation"],
+        settings=config.from_dict(ControlConfig, meta["control"], "control"),
+        policy_period=float(meta["policy_period"]),
+        robot=Robot(**robot_meta),
+        provenance=meta["provenance"],
+    )
 
 
 ROBOT_SHAPES = {

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from bipedtrack import control, env, kinematics, observation, planner, plans, robot
+from bipedtrack.disturbances import UNDISTURBED, Hooks
 from bipedtrack.nodes import Nodes
 from bipedtrack.rewards import stationary
 from bipedtrack.rotations import Array
-from bipedtrack.trace import Trace
+from bipedtrack.trace import Trace, upright
 
 Act = Callable[[Array], Array]  # the network's output (12,) for an observation (101,), in jax.numpy
 _CHUNK = 50  # policy steps between two looks at whether anybody is still up
@@ -59,7 +60,7 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
         def control_step(carry: Any, _: None) -> tuple[Any, _Sample]:
             (physics, episode), alive = carry
             command = the_env.command(episode)
-            alive = alive & _upright(physics.qpos, physics.qvel)
+            alive = alive & upright(physics.qpos, physics.qvel)
             moved, answer = the_env.control_step(physics, episode, following, a_fb)
             sample = _Sample(
                 physics.qpos, physics.qvel, command.target, command.timer, stationary(command.rates), a_fb,
@@ -124,9 +125,7 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
     - sizes: of the plans' boxes, m.
     - seconds: how long.
     - converged: solve contacts to convergence.
-    - model_of: (model, episode) -> the model of that episode, for changed masses, friction or motors.
-    - before_step: (tick, datas, joint targets (e, 12)) -> joint targets, for pushes and delays.
-    - observed: (tick, qpos, qvel) -> what the controller is told of them, for noise.
+    - hooks: what may go otherwise.
     """
     import mujoco
 
@@ -154,18 +153,12 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
         sizes: Sequence[Sequence[float]],
         seconds: float,
         converged: bool = False,
-        model_of: Callable[[Any, int], Any] | None = None,
-        before_step: Callable[[int, Sequence[Any], np.ndarray], np.ndarray] | None = None,
-        observed: Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
+        hooks: Hooks = UNDISTURBED,
     ) -> Trace:
         robots, ticks = batch.boxes.shape[0], round(seconds / the_robot.timestep)
         batch = jax.tree.map(np.asarray, batch)
-        model = robot.build_model(the_robot.name, sizes, converged, touch=True)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        models = [model if model_of is None else model_of(copy.copy(model), i) for i in range(robots)]
-        for changed in models if model_of is not None else []:
-            mujoco.mj_setConst(changed, mujoco.MjData(changed))  # what MuJoCo derives from masses
-        datas = [mujoco.MjData(m) for m in models]
+        models = _models(robot.build_model(the_robot.name, sizes, converged, touch=True), robots, hooks)
+        datas = [mujoco.MjData(model) for model in models]
         numbers = [
             plans.step_numbers(jax.tree.map(lambda a, i=i: a[i], batch), the_robot.timestep, ticks) for i in range(robots)
         ]
@@ -190,22 +183,21 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
                     poses = batch.boxes[i, index[i, tick]]
                     datas[i].mocap_pos[:], datas[i].mocap_quat[:] = poses[:, :3], poses[:, 3:]
                 qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
-                alive = alive & np.asarray(_upright(qpos.T, qvel.T))
-                seen = (qpos, qvel) if observed is None else observed(tick, qpos, qvel)
+                alive = alive & np.asarray(upright(qpos.T, qvel.T))
+                seen = (qpos, qvel) if hooks.observed is None else hooks.observed(tick, qpos, qvel)
                 told = [np.where(alive[:, None], part, 0.0).astype(np.float32) for part in seen]
                 think = np.full(robots, tick % hold == 0)
                 targets, memory, target, timer, still = answer(
                     on_device, index[:, tick], within[:, tick], memory, *told, think
                 )
                 wanted = np.asarray(targets, np.float64)
-                if before_step is not None:
-                    wanted = before_step(tick, datas, wanted)
+                if hooks.before_step is not None:
+                    wanted = hooks.before_step(tick, datas, wanted)
                 for data, ctrl in zip(datas, wanted, strict=True):
                     data.ctrl[:] = ctrl
                 list(pool.map(simulate, shares))
                 forces = np.array([d.sensordata for d in datas])
-                part = (target, timer, still, memory.feedback)
-                target, timer, still, feedback = jax.tree.map(np.asarray, part)
+                target, timer, still, feedback = jax.tree.map(np.asarray, (target, timer, still, memory.feedback))
                 samples.append(_Sample(qpos, qvel, target, timer, still, feedback, wanted, forces, alive))
                 if not alive.any():
                     break
@@ -215,16 +207,23 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
     return record
 
 
+def _models(model: Any, robots: int, hooks: Hooks) -> list[Any]:
+    """The model of each robot: one for all, or one of its own for each."""
+    import mujoco
+
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if hooks.model_of is None:
+        return [model] * robots
+    models = [hooks.model_of(copy.copy(model), i) for i in range(robots)]
+    for changed in models:
+        mujoco.mj_setConst(changed, mujoco.MjData(changed))  # what MuJoCo derives from masses
+    return models
+
+
 def _start(the_robot: robot.Robot, settings: control.ControlConfig, plan: plans.Plan) -> tuple[Array, _Memory]:
     """A robot, qpos (19,), on the plan's first command, soles level, and a controller that asks for that."""
     qpos, memory = env.standing(the_robot, settings, jax.tree.map(lambda a: a[0], plan.steps.start))
     return qpos, _Memory(memory, jnp.zeros(len(the_robot.joint_names)))
-
-
-def _upright(qpos: Array, qvel: Array) -> Array:
-    """Whether a robot's state is finite and its trunk tilted by less than 60 deg; leading axes of 19 and 18."""
-    finite = (abs(qpos) < 1e6).all(axis=0) & (abs(qvel) < 1e6).all(axis=0)
-    return finite & (1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2) > 0.5)
 
 
 def _of_length(entries: np.ndarray, ticks: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from bipedtrack import config, paths
+from bipedtrack.messages import Refusal
 
 LEGS = ("left", "right")
 
@@ -74,7 +75,7 @@ class Description:
             raise ValueError(f"feedback_ratio must lie in [0, 2], not {self.feedback_ratio}")
 
 
-class RobotError(ValueError):
+class RobotError(Refusal, ValueError):
     """A robot that cannot be had, in one line that says which are there or what its model lacks."""
 
 
@@ -107,16 +108,11 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
     joints = [model.joint(n) for n in joint_names]
     low, high = np.array([j.range for j in joints]).T
 
-    def chain(leg: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Offsets trunk to hip, hip to knee, knee to ankle, from the bodies that carry those joints."""
-        carried = {name: model.body(int(model.joint(f"{leg}_{name}").bodyid[0])) for name in description.joints}
-        return carried["hip_yaw"].pos, carried["knee"].pos, carried["ankle_pitch"].pos
+    def links(leg: str) -> list[Any]:
+        """Thigh, shank and foot, the bodies that carry those joints."""
+        return [model.body(int(model.joint(f"{leg}_{joint}").bodyid[0])) for joint in ("hip_yaw", "knee", "ankle_pitch")]
 
-    def link(joint: str) -> Any:
-        return model.body(int(model.joint(f"{description.legs[0]}_{joint}").bodyid[0]))
-
-    left, right = (chain(leg) for leg in description.legs)
-    links = [link(joint) for joint in ("hip_yaw", "knee", "ankle_pitch")]
+    left, right = map(links, description.legs)
     soles = [g for g in map(model.geom, range(model.ngeom)) if g.name.startswith(f"{description.legs[0]}_sole")]
     if not soles:
         raise RobotError(f"{name}: no geom is named {description.legs[0]}_sole_*, which touch the ground")
@@ -124,9 +120,9 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
     return Robot(
         name=name,
         joint_names=joint_names,
-        hips=np.array([left[0], right[0]]),
-        thigh=float(-left[1][2]),
-        shank=float(-left[2][2]),
+        hips=np.array([left[0].pos, right[0].pos]),
+        thigh=float(-left[1].pos[2]),
+        shank=float(-left[2].pos[2]),
         ankle_height=float(soles[0].size[0] - corners[0, 2]),
         sole=2 * np.abs(corners[:, :2]).max(axis=0),
         leg_length=np.array(description.leg_length),
@@ -136,8 +132,8 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         kp=model.actuator_gainprm[:, 0].copy(),
         kd=-model.actuator_biasprm[:, 2],
         torque_limit=model.actuator_forcerange[:, 1].copy(),
-        masses=np.array([model.body(description.trunk).mass[0], *(link.mass[0] for link in links)]),
-        centres=np.array([-link.ipos[2] for link in links]),
+        masses=np.array([model.body(description.trunk).mass[0], *(link.mass[0] for link in left)]),
+        centres=np.array([-link.ipos[2] for link in left]),
         timestep=float(model.opt.timestep),
     )
 

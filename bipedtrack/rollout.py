@@ -13,8 +13,7 @@ import numpy as np
 from bipedtrack import tasks
 from bipedtrack.env import TrackingEnv
 from bipedtrack.rotations import Array
-
-ERRORS = ("ankle_error_cm", "ankle_yaw_error_deg", "trunk_error_cm", "trunk_error_deg")
+from bipedtrack.tasks import ERRORS
 
 
 class Outcome(NamedTuple):

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from bipedtrack import footsteps, paths, rotations
-from bipedtrack.footsteps import Box
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import LEGS, Robot
+from bipedtrack.terrain import Box, standing_feet
 
 
 def ready() -> dict[str, pathlib.Path]:
@@ -48,7 +48,7 @@ def _line(robot: Robot, step: TaskStep, boxes: Sequence[Box]) -> str:
     if len(feet):
         (x, y, z), yaw = end.ankle_positions[feet].mean(axis=0), end.ankle_yaws[feet].mean()
         place = (x, y, z - robot.ankle_height, rotations.wrap(yaw), step.period, step.lift[feet[0]])
-        up = " up" if len(feet) == 1 and feet[0] not in footsteps.standing_feet(robot, boxes, end.ankle_positions) else ""
+        up = " up" if len(feet) == 1 and feet[0] not in standing_feet(robot, boxes, end.ankle_positions) else ""
         cells = ["jump" if len(feet) == len(LEGS) else LEGS[feet[0]] + up, *map(_number, place)]
     return ",".join([*cells, *map(_number, [*end.trunk_position, *rotations.to_euler(end.trunk_orientation)])])
 

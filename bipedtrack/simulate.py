@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from bipedtrack import footsteps, kinematics, nodes, planner, policy, robot, trace
+from bipedtrack import footsteps, kinematics, metrics, nodes, planner, policy, robot, trace
 from bipedtrack.messages import fail
 from bipedtrack.rewards import stationary
 
@@ -56,8 +56,7 @@ def control_step(controller: policy.Controller, model: Any, data: Any, command: 
 
     state = [data.time, data.qpos.copy(), data.qvel.copy()]
     measured = kinematics.measure(controller.policy.robot, state[1])
-    upright = 1 - 2 * (data.qpos[4] ** 2 + data.qpos[5] ** 2)
-    alive = bool(upright > 0.5)  # cos 60 deg; false for nan
+    alive = bool(trace.upright(data.qpos, data.qvel))
     if np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all():
         data.ctrl[:] = controller.step(data.qpos, data.qvel, command)
     mujoco.mj_step(model, data)
@@ -78,16 +77,11 @@ def _stack(column: tuple[Any, ...]) -> Any:
 
 def summary(recorded: trace.Trace) -> str:
     """One line: how long, whether it fell, and the mean errors until then."""
-    errors = [
-        nodes.difference(*(nodes.Nodes(*(part[i] for part in side)) for side in (recorded.target, recorded.measured)))
-        for i in np.flatnonzero(recorded.alive)
-    ]
-    ankles = 100 * np.mean([np.linalg.norm(error.ankle_positions, axis=-1) for error in errors])
-    yaws = np.degrees(np.mean([np.abs(error.ankle_yaws) for error in errors]))
-    trunk = 100 * np.mean([np.linalg.norm(error.trunk_position) for error in errors])
+    errors = {name: np.nanmean(values) for name, values in metrics.errors(recorded).items()}
+    ankles, yaws = (np.mean([errors[f"{leg}_ankle_{what}"] for leg in robot.LEGS]) for what in ("position_cm", "yaw_deg"))
     return (
         f"{recorded.time[-1]:.1f} s, {'no fall' if recorded.alive[-1] else 'fell'}; mean error: "
-        f"ankles {ankles:.1f} cm and {yaws:.1f} deg, trunk {trunk:.1f} cm"
+        f"ankles {ankles:.1f} cm and {yaws:.1f} deg, trunk {errors['trunk_position_cm']:.1f} cm"
     )
 
 

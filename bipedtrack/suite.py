@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import footsteps, paths, plans, robot, tasks, terrain
+from bipedtrack import footsteps, plans, robot, scripts, tasks, terrain
 
 RISERS = (0.05, 0.08, 0.11, 0.14, 0.17)  # m
 TREADS = (0.25, 0.30, 0.35)  # m
@@ -87,7 +87,7 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
       seed: with the task's name, decides the episodes.
     """
     if name in SCRIPTS:
-        return script_batch(footsteps.load(script_path(name), the_robot), episodes)
+        return script_batch(footsteps.load(scripts.ready()[name], the_robot), episodes)
     hold, what = name.startswith("hold-"), _what(name)
     steps = int(np.ceil(seconds / min(ranges.period[0], ranges.squat_period[0]))) + 1
     key = jax.random.fold_in(jax.random.PRNGKey(seed), zlib.crc32(name.encode()))
@@ -145,11 +145,6 @@ def _thirds(kind: str, plan: plans.Plan) -> tuple[Level, ...]:
     mean = (way * swing).sum(axis=(1, 2)) / swing.sum(axis=(1, 2))
     parts = [part for part in np.array_split(np.argsort(mean, kind="stable"), 3) if len(part)]
     return tuple(Level(f"{mean[part[0]]:.0f}-{mean[part[-1]]:.0f} {unit} a step", np.sort(part)) for part in parts)
-
-
-def script_path(name: str) -> pathlib.Path:
-    """The file of a script that ships."""
-    return paths.data_dir("curricula") / "footsteps" / f"{name}.csv"
 
 
 def script_batch(script: footsteps.Script, episodes: int = 1) -> Batch:

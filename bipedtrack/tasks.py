@@ -24,6 +24,7 @@ from bipedtrack.rotations import Array
 KINDS = ("stand", "squat", "walk", "sidle", "turn", "wander", "stairs")
 STAND, SQUAT, WALK, SIDLE, TURN, WANDER, STAIRS = range(len(KINDS))
 MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
+ERRORS = ("ankle_error_cm", "ankle_yaw_error_deg", "trunk_error_cm", "trunk_error_deg")  # of `tracking_errors`
 FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
 _BREAKS = (2.0, 7.0)  # task steps from one break to the next, and one more than the most
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground

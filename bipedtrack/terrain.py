@@ -6,15 +6,20 @@ a tread and reach under the next higher one, so one size serves every staircase.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
+from bipedtrack import rotations
+from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
 STAIR_BOX = (1.2, 2.0, 0.4)  # length, width, height of a tread's box, m
 STAIR_BOXES = 3
 PARKED = -10.0  # m, where a box that is not needed waits
+TOLERANCE = 1e-3  # m: what is this close counts as touching or standing
 
 
 class Stairs(NamedTuple):
@@ -53,3 +58,81 @@ def upright(centres: Array) -> Array:
     xp = namespace(centres)
     turns = xp.asarray([[1.0, 0.0, 0.0, 0.0]] * centres.shape[0], dtype=centres.dtype)
     return xp.concat([centres, turns], axis=-1)
+
+
+# Boxes anywhere
+
+
+class Box(NamedTuple):
+    """An obstacle or a tread, upright, in the world frame."""
+
+    x: float  # m, middle of the bottom face
+    y: float
+    z: float
+    yaw: float  # rad
+    length: float  # m, along its own x axis
+    width: float
+    height: float
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Length, width and height, m: what `robot.build_model` takes."""
+        return self.length, self.width, self.height
+
+    @property
+    def top(self) -> float:
+        """The height of its top face, m."""
+        return self.z + self.height
+
+    @property
+    def position(self) -> np.ndarray:
+        """Its centre, (3,) m: `data.mocap_pos` of its body."""
+        return np.array([self.x, self.y, self.z + self.height / 2])
+
+    @property
+    def orientation(self) -> np.ndarray:
+        """Its unit quaternion, (4,): `data.mocap_quat` of its body."""
+        return np.array(rotations.from_yaw(np.float64(self.yaw)))
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The corners of its faces seen from above, (4, 2) m."""
+        return rectangle(np.array([self.x, self.y]), self.yaw, self.length, self.width)
+
+
+def ground(boxes: Iterable[Box], x: float, y: float, below: float = math.inf) -> float:
+    """The height of the ground at (x, y), m: the highest top that is not above `below`, or the floor."""
+    return max([0.0] + [box.top for box in boxes if box.top <= below and _covers(box, x, y)])
+
+
+def standing_feet(robot: Robot, boxes: Iterable[Box], ankles: np.ndarray) -> list[int]:
+    """Indices of the feet with ankles (2, 3), m, that stand on the ground or on a box."""
+    boxes = tuple(boxes)
+    soles = ankles - np.array([0.0, 0.0, robot.ankle_height])
+    return [foot for foot, (x, y, z) in enumerate(soles) if z - ground(boxes, x, y, z + TOLERANCE) <= TOLERANCE]
+
+
+def _covers(box: Box, x: float, y: float) -> bool:
+    """Whether the box lies under or over (x, y), its edges included."""
+    c, s = math.cos(box.yaw), math.sin(box.yaw)
+    along, across = c * (x - box.x) + s * (y - box.y), c * (y - box.y) - s * (x - box.x)
+    return abs(along) <= box.length / 2 + TOLERANCE and abs(across) <= box.width / 2 + TOLERANCE
+
+
+def rectangle(centre: np.ndarray, yaw: float, length: float, width: float) -> np.ndarray:
+    """The corners of a rectangle, (4, 2) m, one after another."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length / 2, width / 2]
+    return centre + half @ np.array([[c, s], [-s, c]])
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """How deep two rectangles, each (4, 2) m, lie in one another, m; negative where they are apart.
+
+    Convex shapes are apart if they are so along the normal of one of their edges.
+    """
+    edges = np.concatenate([a[1:3] - a[:2], b[1:3] - b[:2]])
+    axes = edges / np.linalg.norm(edges, axis=-1, keepdims=True)  # a rectangle's edges are its normals
+    along_a, along_b = a @ axes.T, b @ axes.T
+    depths = np.minimum(along_a.max(axis=0), along_b.max(axis=0)) - np.maximum(along_a.min(axis=0), along_b.min(axis=0))
+    return float(depths.min())

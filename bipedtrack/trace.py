@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bipedtrack.nodes import Nodes
+from bipedtrack.rotations import Array
 
 
 class Trace(NamedTuple):
@@ -39,8 +40,18 @@ class Trace(NamedTuple):
         """The trace of one of several robots, or of several at indices (k,)."""
         return Trace(self.time, *(_pick(part, index) for part in self[1:]))
 
+    def until(self, count: int) -> Trace:
+        """The first entries of the trace of one robot."""
+        return Trace(*(_pick(part, slice(count)) for part in self))
 
-def _pick(part: Any, index: int | np.ndarray) -> Any:
+
+def upright(qpos: Array, qvel: Array) -> Array:
+    """Whether a robot's state is finite and its trunk tilted by less than 60 deg; leading axes of 19 and 18."""
+    finite = (abs(qpos) < 1e6).all(axis=0) & (abs(qvel) < 1e6).all(axis=0)
+    return finite & (1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2) > 0.5)
+
+
+def _pick(part: Any, index: int | slice | np.ndarray) -> Any:
     return Nodes(*(array[index] for array in part)) if isinstance(part, Nodes) else part[index]
 
 

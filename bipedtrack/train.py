@@ -17,7 +17,7 @@ import tyro
 from bipedtrack import checkpoint, compilation, config, curriculum, distributed, robot, versions
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.distributed import ALONE, Process
-from bipedtrack.messages import fail, quiet_imports
+from bipedtrack.messages import Refusal, fail, quiet_imports
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
 EVALUATION_DIFFICULTY = 0.5
@@ -58,7 +58,7 @@ def main() -> None:
     try:
         versions.require()
         process = distributed.join(options.coordinator, options.processes, options.process, options.distributed)
-    except (versions.VersionError, distributed.DistributedError) as error:
+    except Refusal as error:
         fail(str(error))
     if process.count == 1:
         _run_or_fail(options, process)
@@ -70,7 +70,7 @@ def _run_or_fail(options: Train, process: Process) -> None:
     """Trains, or says in one line on stderr what was wrong and exits with status 2."""
     try:
         run(options, process)
-    except REFUSALS as error:
+    except Refusal as error:
         fail(str(error))
 
 
@@ -97,18 +97,8 @@ def _run_among_others(options: Train, process: Process) -> NoReturn:
     distributed.leave(status)
 
 
-class DeviceError(RuntimeError):
+class DeviceError(Refusal, RuntimeError):
     """The wanted device is not there; the message is one line."""
-
-
-REFUSALS = (
-    config.ConfigError,
-    robot.RobotError,
-    checkpoint.RunError,
-    checkpoint.CheckpointError,
-    distributed.DistributedError,
-    DeviceError,
-)
 
 
 def use_devices(device: str, count: int, ppo: curriculum.PpoConfig, process: Process = ALONE) -> tuple[int, str]:

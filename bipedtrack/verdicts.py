@@ -124,11 +124,9 @@ def _judge(subject: dict[str, str], claim: _Claim, value: float | None, but: str
         words += (f" ({detail})" if detail else "") + (f", but {but}" if but else "")
     return {
         **subject,
-        **{
-            "claim": claim.words,
-            "figure": words,
-            "bound": f"at {'least' if claim.at_least else 'most'} {claim.limit:g} {claim.unit}",
-        },
+        "claim": claim.words,
+        "figure": words,
+        "bound": f"at {'least' if claim.at_least else 'most'} {claim.limit:g} {claim.unit}",
         **{"value": value, "limit": claim.limit, "unit": claim.unit, "met": met},
     }
 

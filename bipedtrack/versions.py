@@ -4,8 +4,10 @@ import re
 from importlib import metadata
 from typing import NamedTuple
 
+from bipedtrack.messages import Refusal
 
-class VersionError(RuntimeError):
+
+class VersionError(Refusal, RuntimeError):
     """A package is missing or runs in a version outside the tested range; the message is one line."""
 
 

@@ -1,4 +1,4 @@
-"""Films of what was recorded: the robot, green traces of its targets, yellow ones of itself, prints where feet shall go.
+"""Films of the robot at a task or on its way through a footstep script, made of `pictures`.
 
 python -m bipedtrack.video policy.npz --script walk.csv --out walk.mp4
 python -m bipedtrack.video policy.npz --task stairs-up --out stairs.mp4
@@ -9,7 +9,6 @@ Everything is rendered without a screen. The suffix decides: .mp4 (H.264) and .g
 from __future__ import annotations
 
 import contextlib
-import copy
 import dataclasses
 import itertools
 import os
@@ -19,48 +18,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from bipedtrack import doctor, footsteps, policy, robot, simulate
-from bipedtrack.messages import fail
-from bipedtrack.nodes import Nodes
+from bipedtrack.messages import Refusal, fail
+from bipedtrack.pictures import COLORS, render
 from bipedtrack.trace import Trace
 
 SUFFIXES = (".mp4", ".gif", ".png")
-TARGET_COLOR = (0.00, 0.80, 0.00, 1.0)  # pure hues, which stay what they are in any light
-MEASURED_COLOR = (1.00, 0.90, 0.00, 1.0)
-PRINT_COLORS = ((0.16, 0.45, 0.85, 1.0), (0.95, 0.45, 0.10, 1.0))  # left, right
-_COLORS = (TARGET_COLOR, MEASURED_COLOR, *PRINT_COLORS)
-TARGET_WIDTH, MEASURED_WIDTH = 1 / 90, 1 / 160  # of the picture's height; where both agree, green frames yellow
-PRINT_THICKNESS = 0.003  # m
-TAIL = 2.0  # s, how long a trace lasts behind the robot and a print after its touchdown
-AHEAD = 1.0  # s, how long before its swing begins a foothold is shown
-_TRACE_POINTS = 30  # per second
-_SMOOTHING = 1.0  # s of the trunk's path over which the camera averages
-
-# Measured at 640 x 480 with EGL in software: a picture takes 75 ms of one core, of which antialiasing 40 and shadows 25.
-# The MJCF's own settings (reflecting floor, larger shadow map) took 260 ms, and capsules instead of lines 250 ms more.
-_SAMPLES, _SHADOW_MAP = 4, 1024
 
 
-class VideoError(RuntimeError):
+class VideoError(Refusal, RuntimeError):
     """A film that cannot be made or written; the message is one line."""
-
-
-class Foothold(NamedTuple):
-    """Where a foot is planned to touch down."""
-
-    foot: int  # 0 left, 1 right
-    begin: float  # s, when its swing begins
-    touchdown: float  # s
-    position: np.ndarray  # (3,) m, the point on the ground under the ankle, in the world frame
-    yaw: float  # rad
-
-
-# Rendering back ends
 
 
 def choose_backend() -> str:
@@ -89,170 +61,6 @@ def choose_backend() -> str:
     raise VideoError(f"nothing renders here ({reasons}); wanted {right}")
 
 
-# What is in the picture
-
-
-def footholds(recorded: Trace, ankle_height: float) -> list[Foothold]:
-    """Where and when the target put each swinging foot down, (n, ...) arrays of one robot, in the order of time.
-
-    A swing that is not over when the trace ends has no foothold.
-    """
-    found = []
-    for foot in range(2):
-        timer = recorded.timer[:, foot]
-        swings = timer > 0
-        # a foot that swings twice in a row has its timer set anew in between
-        breaks = np.diff(timer) > 0.5 * recorded.timestep
-        begins = np.flatnonzero(swings & np.concatenate([[True], ~swings[:-1] | breaks]))
-        ends = np.flatnonzero(swings[:-1] & (~swings[1:] | breaks)) + 1
-        for begin, end in zip(begins, ends, strict=False):
-            position = np.array(recorded.target.ankle_positions[end, foot], float) - [0, 0, ankle_height]
-            yaw = float(recorded.target.ankle_yaws[end, foot])
-            found.append(Foothold(foot, float(recorded.time[begin]), float(recorded.time[end]), position, yaw))
-    return sorted(found, key=lambda foothold: foothold.begin)
-
-
-def render(
-    model: Any,
-    the_robot: robot.Robot,
-    recorded: Trace,
-    ticks: np.ndarray,
-    boxes: np.ndarray | None = None,
-    size: tuple[int, int] = (640, 480),
-) -> Iterator[np.ndarray]:
-    """Pictures (height, width, 3) uint8 of one recorded robot, one for each tick. Needs MUJOCO_GL where no screen is.
-
-    Args:
-      model: MuJoCo's, from `robot.build_model`; it is not changed.
-      the_robot: its constants, for the size of a sole.
-      recorded: the trace, arrays (n, ...).
-      ticks: indices into the trace.
-      boxes: where the model's mocap bodies are, position m and quaternion: (n, boxes, 7), or (boxes, 7) if they stay.
-      size: width and height in pixels.
-
-    Raises:
-      ValueError: boxes or the trace have another shape.
-    """
-    import mujoco
-
-    if recorded.qpos.shape != (len(recorded.time), model.nq):
-        raise ValueError(f"qpos of the trace has shape {recorded.qpos.shape}; wanted {(len(recorded.time), model.nq)}")
-    boxes = _box_poses(boxes, len(recorded.time), model.nmocap)
-    planned = footholds(recorded, the_robot.ankle_height)
-    middle = _smoothed(np.asarray(recorded.qpos[:, :3], float), round(_SMOOTHING / recorded.timestep))
-
-    model = _fast_to_render(model, size)
-    data = mujoco.MjData(model)
-    camera, options = mujoco.MjvCamera(), mujoco.MjvOption()
-    camera.distance, camera.azimuth, camera.elevation = 2.5, 128, -16
-    options.geomgroup[3] = 0  # shapes that only collide
-    with mujoco.Renderer(model, size[1], size[0]) as renderer:
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        for tick in map(int, ticks):
-            _place(model, data, recorded.qpos[tick], boxes[tick])
-            data.light_xpos[:, :2] += middle[tick, :2]  # the shadow map covers the surroundings of the light alone
-            camera.lookat[:] = middle[tick] - [0, 0, 0.22]
-            renderer.update_scene(data, camera, options)
-            target, measured = (_tail(nodes, tick, recorded.timestep) for nodes in (recorded.target, recorded.measured))
-            _add_traces(renderer.scene, target, TARGET_COLOR, TARGET_WIDTH * size[1])
-            _add_traces(renderer.scene, measured, MEASURED_COLOR, MEASURED_WIDTH * size[1])
-            for foothold in planned:
-                shown = foothold.begin - AHEAD <= recorded.time[tick] <= foothold.touchdown + TAIL
-                if shown and _has_ground(model, data, foothold.position):
-                    _add_print(renderer.scene, foothold, the_robot.sole)
-            yield renderer.render()
-
-
-def _box_poses(boxes: np.ndarray | None, count: int, wanted: int) -> np.ndarray:
-    """Poses (n, boxes, 7)."""
-    given = np.zeros((0, 7)) if boxes is None else np.asarray(boxes, float)
-    if given.shape not in ((wanted, 7), (count, wanted, 7)):
-        raise ValueError(f"boxes have shape {given.shape}; wanted {(wanted, 7)} or {(count, wanted, 7)}")
-    return np.broadcast_to(given, (count, wanted, 7))
-
-
-def _fast_to_render(model: Any, size: tuple[int, int]) -> Any:
-    """A copy of the model with room for the picture and the quality that the time allows."""
-    model = copy.deepcopy(model)
-    model.vis.global_.offwidth, model.vis.global_.offheight = size
-    model.vis.quality.offsamples, model.vis.quality.shadowsize = _SAMPLES, _SHADOW_MAP
-    return model
-
-
-def _place(model: Any, data: Any, qpos: np.ndarray, boxes: np.ndarray) -> None:
-    """Computes where everything is that is drawn, with the robot at qpos (19,) and the boxes at (boxes, 7)."""
-    import mujoco
-
-    data.qpos[:] = qpos
-    data.mocap_pos[:], data.mocap_quat[:] = boxes[:, :3], boxes[:, 3:]
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_camlight(model, data)
-
-
-def _smoothed(path: np.ndarray, width: int) -> np.ndarray:
-    """The moving average of a path (n, 3) over `width` entries, its ends held."""
-    before = width // 2
-    padded = np.concatenate([np.repeat(path[:1], before, axis=0), path, np.repeat(path[-1:], width - before, axis=0)])
-    total = np.cumsum(np.concatenate([np.zeros((1, 3)), padded]), axis=0)
-    return (total[width:] - total[:-width])[: len(path)] / width
-
-
-def _tail(nodes: Nodes, tick: int, timestep: float) -> np.ndarray:
-    """The last places of trunk, left and right ankle, (3, points, 3) m, up to the given tick."""
-    every = max(1, round(1 / (_TRACE_POINTS * timestep)))
-    first = max(0, tick - round(TAIL / timestep))
-    # always the same ticks, so that a trace lies still while its end moves on
-    picked = [*range(-(-first // every) * every, tick, every), tick]
-    ankles = np.asarray(nodes.ankle_positions, float)[picked]
-    return np.stack([np.asarray(nodes.trunk_position, float)[picked], ankles[:, 0], ankles[:, 1]])
-
-
-def _add_traces(scene: Any, paths: np.ndarray, color: tuple[float, ...], width: float) -> None:
-    """Adds each path (points, 3) of (paths, points, 3), m, to the scene as lines of a width in pixels."""
-    import mujoco
-
-    line = mujoco.mjtGeom.mjGEOM_LINE
-    for path in paths:
-        for start, end in zip(path[:-1], path[1:], strict=True):
-            mujoco.mjv_connector(_add_geom(scene, line, color), line, width, start, end)
-
-
-def _add_print(scene: Any, foothold: Foothold, sole: np.ndarray) -> None:
-    """Adds a foothold to the scene as a flat box of the size of a sole, (2,) m."""
-    import mujoco
-
-    cosine, sine = np.cos(foothold.yaw), np.sin(foothold.yaw)
-    geom = _add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, PRINT_COLORS[foothold.foot])
-    geom.size[:] = [sole[0] / 2, sole[1] / 2, PRINT_THICKNESS / 2]
-    geom.pos[:] = foothold.position
-    geom.mat[:] = [[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]
-
-
-def _add_geom(scene: Any, shape: Any, color: tuple[float, ...]) -> Any:
-    """A new decoration of the scene, still without size and place."""
-    import mujoco
-
-    geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, shape, np.zeros(3), np.zeros(3), np.eye(3).reshape(9), np.array(color, np.float32))
-    scene.ngeom += 1
-    return geom
-
-
-def _has_ground(model: Any, data: Any, point: np.ndarray) -> bool:
-    """Whether the floor or the top of a box lies at the point (3,): treads far from the robot may be missing."""
-    if abs(point[2]) < 0.01:
-        return True
-    for geom in np.flatnonzero(model.body_mocapid[model.geom_bodyid] >= 0):
-        local = (point - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
-        if (np.abs(local) < model.geom_size[geom] + 0.01).all() and local[2] > model.geom_size[geom][2] - 0.01:
-            return True
-    return False
-
-
-# Files
-
-
 def film(
     model: Any,
     the_robot: robot.Robot,
@@ -266,7 +74,7 @@ def film(
     """Renders the trace of one robot, until it falls, to a file, whole or not at all; returns the number of pictures.
 
     Args:
-      model, the_robot, recorded, boxes, size: as for `render`.
+      model, the_robot, recorded, boxes, size: as for `pictures.render`.
       path: ends in .mp4, .gif (both play in real time) or .png (a strip of upright pictures of this height).
       fps: pictures a second of a film.
       pictures: how many, evenly spaced, of a strip.
@@ -300,8 +108,7 @@ def film(
 def _until_fall(recorded: Trace, boxes: np.ndarray | None) -> tuple[Trace, np.ndarray | None]:
     """The trace and the boxes without what follows a fall."""
     count = len(recorded.time) if recorded.alive.all() else int(np.argmin(recorded.alive))
-    parts: list[Any] = [Nodes(*(a[:count] for a in part)) if isinstance(part, Nodes) else part[:count] for part in recorded]
-    return Trace(*parts), boxes[:count] if boxes is not None and np.ndim(boxes) == 3 else boxes
+    return recorded.until(count), boxes[:count] if boxes is not None and np.ndim(boxes) == 3 else boxes
 
 
 def require_writable(path: pathlib.Path, size: tuple[int, int] = (640, 480)) -> None:
@@ -369,7 +176,7 @@ def _write_gif(path: pathlib.Path, frames: Iterator[np.ndarray], count: int, fps
 
     first = next(frames)
     # one palette for all, from the first picture and what it may lack
-    bands = [np.full((8, *first.shape[1:]), 255 * np.array(color[:3])) for color in _COLORS]
+    bands = [np.full((8, *first.shape[1:]), 255 * np.array(color[:3])) for color in COLORS]
     palette = Image.fromarray(np.concatenate([first, *bands]).astype(np.uint8)).quantize()
     images = (
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)

@@ -1,8 +1,10 @@
 """What many tests share: the robot, its compiled model, the default curriculum. JAX runs on the CPU."""
 
+import concurrent.futures
 import functools
+import multiprocessing
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
@@ -13,8 +15,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import reports
+from filmed import Rendered
 
-from bipedtrack import planner, tasks
+from bipedtrack import planner, tasks, video
 from bipedtrack import robot as robots
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.curriculum import load as load_curriculum
@@ -83,3 +87,39 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
         return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
 
     return draw
+
+
+@pytest.fixture(scope="module")
+def unoptimised() -> Iterator[None]:
+    """Compiles in half the time what runs only once."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture(scope="session")
+def whole(robot: robots.Robot) -> dict[str, Any]:
+    """A record of an evaluation, made by hand: two policies on three engines, with robustness."""
+    return reports.make(robot)
+
+
+@pytest.fixture
+def record(whole: dict[str, Any]) -> dict[str, Any]:
+    """The same for a test to change."""
+    return reports.copied(whole)
+
+
+@pytest.fixture(scope="session")
+def rendered() -> Iterator[Rendered]:
+    """Calls a function of a test's module where mujoco renders; skips where no back end does.
+
+    A process renders with one back end for all its life, so pictures come from a process of their own.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as process:
+        try:
+            assert process.submit(video.choose_backend).result() in ("egl", "osmesa", "glfw", os.environ.get("MUJOCO_GL"))
+        except video.VideoError as error:
+            pytest.skip(str(error))
+        yield lambda function, *arguments: process.submit(function, *arguments).result()

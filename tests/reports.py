@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from bipedtrack import metrics, verdicts
-from bipedtrack.metrics import Boxes
 from bipedtrack.nodes import Nodes
 from bipedtrack.record import ENGINES
 from bipedtrack.robot import Robot
+from bipedtrack.swings import Boxes
 from bipedtrack.trace import Trace
 
 DT = 0.005  # s

@@ -14,22 +14,23 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 
 # A module may import those before it: on a line above, or further left on its own.
 LADDER = """
-    versions paths messages record drawing
+    messages versions paths record markup drawing
     compilation distributed
     config checkpoint
     rotations robot
     nodes kinematics trace packets
-    planner terrain
-    tasks footsteps scripts steering plans disturbances control observation rewards metrics verdicts charts
+    planner terrain feasibility rows
+    tasks footsteps scripts steering plans disturbances control observation rewards swings metrics verdicts charts
     policy follower onnx_export env autoreset
-    curriculum rollout progress recording suite
-    training evaluation report
+    curriculum rollout progress recording suite pictures
+    training evaluation sheets comparisons report
     doctor train export evaluate simulate video teleop drive realtime scene page play __main__
 """.split()
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
 DEPLOYMENT = (
-    "rotations nodes kinematics planner control observation policy footsteps packets follower robot config checkpoint"
+    "rotations nodes kinematics planner terrain feasibility rows footsteps control observation policy packets follower"
+    " robot config checkpoint"
 ).split()
 ABSENT = ("jax", "flax", "brax", "optax", "mujoco")
 

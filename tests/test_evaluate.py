@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 from importlib import metadata
 from typing import Any, NamedTuple
 
-import jax
 import mujoco
 import numpy as np
 import pytest
 import tyro
+from traces import by_mujoco
 
 import bipedtrack
 from bipedtrack import evaluate, footsteps, kinematics, metrics, policy, suite, trace
@@ -32,6 +32,7 @@ ENVIRONMENT = os.environ | {
     "JAX_PLATFORMS": "cpu",
 }
 PATIENCE = 900  # s that anything may take on a busy machine
+pytestmark = pytest.mark.usefixtures("unoptimised")
 ENGINES = ("mjx", "mujoco", "converged")
 SECONDS, TICKS = 0.65, 130  # no whole number of policy periods
 SHORT = "\n".join([",".join(footsteps.COLUMNS), "left,0.1,,,0.1,0.3", "both,,,,,0.1"])  # 0.4 s
@@ -103,19 +104,6 @@ def nodes(arrays: dict[str, np.ndarray], side: str) -> Nodes:
     return Nodes(*(arrays[f"{side}_{field}"].astype(float) for field in Nodes._fields))
 
 
-def by_mujoco(model: mujoco.MjModel, states: np.ndarray) -> Nodes:
-    """The nodes at qpos (n, 19) by MuJoCo's own kinematics."""
-    data, found = mujoco.MjData(model), []
-    feet = [data.body(name) for name in ("left_foot", "right_foot")]
-    for qpos in states:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        yaws = [math.atan2(foot.xmat[3], foot.xmat[0]) for foot in feet]
-        trunk = data.body("trunk")
-        found.append((trunk.xpos.copy(), trunk.xquat.copy(), [foot.xpos.copy() for foot in feet], yaws))
-    return Nodes(*map(np.array, zip(*found, strict=True)))
-
-
 def errors(target: Nodes, real: Nodes) -> dict[str, np.ndarray]:
     """By the names of the summary: (n,) each."""
     turns = []
@@ -184,14 +172,6 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
 
 
 # Ablations
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_compile() -> Iterator[None]:
-    """The programs of this process run once."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")

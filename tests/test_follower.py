@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bipedtrack import footsteps, kinematics, nodes, planner, rotations
+from bipedtrack import footsteps, kinematics, nodes, planner, rotations, terrain
 from bipedtrack.follower import HOLD, Follower
 from bipedtrack.nodes import NodeRates, Nodes
 from bipedtrack.packets import FASTEST, Packet, Refused, speed
@@ -205,7 +205,7 @@ def test_a_foot_out_of_reach_comes_to_where_the_leg_reaches(follower: Follower, 
 
 
 def test_a_foot_under_the_ground_stands_on_it(robot: Robot) -> None:
-    box = footsteps.Box(0.3, 0.1, 0, 0, 0.3, 0.3, 0.1)
+    box = terrain.Box(0.3, 0.1, 0, 0, 0.3, 0.3, 0.1)
     follower = Follower(robot, footsteps.initial_nodes(robot), [box])
     follower.accept(Packet(1, 0.0, shifted(robot, foot=(0.3, 0, -0.05))))
     found = advance(follower, 60)[-1].target.ankle_positions
@@ -217,7 +217,7 @@ def test_a_foot_under_the_ground_stands_on_it(robot: Robot) -> None:
 
 
 def test_after_a_silence_it_stands_over_its_feet_on_the_ground_under_them(robot: Robot) -> None:
-    box = footsteps.Box(0.2, 0.1, 0, 0, 0.3, 0.2, 0.05)
+    box = terrain.Box(0.2, 0.1, 0, 0, 0.3, 0.2, 0.05)
     follower = Follower(robot, footsteps.initial_nodes(robot), [box])
     up = shifted(robot, dx=0.05, dz=-0.1, foot=(0.15, 0, 0.12))
     up = up._replace(trunk_orientation=rotations.from_euler(*np.array([0.1, -0.1, 0.2])), ankle_yaws=np.array([0.3, 0.1]))

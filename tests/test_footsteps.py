@@ -1,6 +1,5 @@
-"""Footstep scripts: their commands worked by hand, their defaults, and every way they can be wrong."""
+"""Footstep scripts: their commands worked by hand, their defaults, and what any text and any file become."""
 
-import dataclasses
 import itertools
 import math
 import re
@@ -13,45 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from walks import HEADER, RANGER, STAIRS, WALK, line_numbers, parse, problems
 
 from bipedtrack import footsteps, kinematics, nodes, planner, robot, rotations
-from bipedtrack.footsteps import Script, ScriptError
-
-HEADER = "foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw\n"
-WALK = """# a short walk and a bow
-foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw
-left,0.2,0.1,0,0,0.5,0.06
-
-right,0.4,-0.1,0,0.2,0.602,,0.32,0.01,0.7,0,0.1,0.1
-both,,,,,1,,,,0.68,,0.15
-both,,,,,0.25
-"""
-STAIRS = """# box 0.8 0 0 0 0.8 1 0.1
-# box 0.95 0 0.1 0 0.5 1 0.1,,,,,,
-foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw
-left,0.25,0.1
-right,0.5,-0.1
-left,0.8,0.1
-right,0.85,-0.1,0.2
-left,0.95
-"""
-# the workspace that the numbers below are worked out for
-RANGER = dataclasses.replace(
-    robot.load(),
-    leg_length=np.array([0.35, 0.74]),
-    joint_low=np.radians([-45, -30, -100, 0, -75, -30] * 2),
-    joint_high=np.radians([45, 30, 40, 140, 45, 30] * 2),
-)
-
-
-def parse(rows: str, header: str = HEADER) -> Script:
-    return footsteps.parse(header + rows, RANGER, "walk.csv")
-
-
-def problems(text: str) -> list[str]:
-    with pytest.raises(ScriptError) as caught:
-        footsteps.parse(text, RANGER, "walk.csv")
-    return str(caught.value).split("\n")
+from bipedtrack.footsteps import ScriptError
 
 
 def turned(target: np.ndarray, real: np.ndarray) -> float:
@@ -168,15 +132,6 @@ def test_yaw_counts_modulo_a_whole_turn_and_goes_the_shorter_way() -> None:
     assert turned(step.end.trunk_orientation, rotations.from_yaw(np.float64(0.15))) < 1e-9
 
 
-def test_columns_in_any_order_quotes_padding_and_comments() -> None:
-    text = 'trunk_yaw,"trunk_pitch",trunk_roll,trunk_z,trunk_y,trunk_x,lift,period,yaw,z,y,x,foot,,\r\n'
-    text += '#left,9\r\n,,,,,,,0.4,,0,0.1, 0.2 ,"left",,\r\n,,,,,,,,,,,,\r\n  # boxes: none\r\n'
-    script = parse(text, header="")
-    assert script.lines == (3,)
-    np.testing.assert_allclose(script.steps[0].end.ankle_positions[0], [0.2, 0.1, 0.04])
-    assert script.boxes == ()
-
-
 def test_an_empty_height_is_that_of_the_ground() -> None:
     script = parse(STAIRS, header="")
     heights = [step.end.ankle_positions[:, 2] - RANGER.ankle_height for step in script.steps]
@@ -186,23 +141,6 @@ def test_an_empty_height_is_that_of_the_ground() -> None:
     # the swing rises over the higher end
     top = max(c.target.ankle_positions[1, 2] for c in itertools.islice(footsteps.commands(script, 0.005), 110, 220))
     assert top == pytest.approx(0.04 + 0.1 + 0.08, abs=0.01)
-
-
-def test_boxes_stand_in_the_simulator_where_the_script_says() -> None:
-    script = parse("# box 0.6 0.1 0.3 0.5 0.4 0.3 0.2\nleft")
-    box = script.boxes[0]
-    model = robot.build_model("ranger_max", boxes=[box.size for box in script.boxes])
-    data = mujoco.MjData(model)
-    data.mocap_pos[0], data.mocap_quat[0] = box.position, box.orientation
-    mujoco.mj_kinematics(model, data)
-    geom = model.geom("box_0").id
-    local = model.geom_size[geom] * [[1, 1, -1], [-1, 1, -1], [-1, -1, 1]]
-    corners = data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
-    np.testing.assert_allclose(corners[:, :2], box.corners[:3], atol=1e-12)
-    np.testing.assert_allclose(corners[:, 2], [0.3, 0.3, 0.5], atol=1e-12)
-    # length along its own x, which points 0.5 rad to the left
-    along = (corners[0] - corners[1])[:2]
-    np.testing.assert_allclose(along, [0.4 * math.cos(0.5), 0.4 * math.sin(0.5)], atol=1e-12)
 
 
 def test_the_start_is_a_stand() -> None:
@@ -284,83 +222,6 @@ def test_the_clock_counts_whole_control_steps() -> None:
     assert len(list(footsteps.commands(script, 0.005, 5.0))) == 1000
 
 
-# What is wrong, the line it stands on, and words that must name it and what would be right. Line 1 is the header.
-WRONG = {
-    "unknown foot": ("lfet,0.1", 2, "foot is 'lfet'; wanted left, right, left up, right up, jump or both"),
-    "no foot": (",0.1", 2, "foot is ''; wanted left, right, left up, right up, jump or both"),
-    "not a number": ("left,0,1.2.3", 2, "y is '1.2.3'; wanted a finite number of m"),
-    "not a number of radians": ("left,0,0.1,0,ten", 2, "yaw is 'ten'; wanted a finite number of rad"),
-    "not finite": ("left,nan", 2, "x is 'nan'; wanted a finite number of m"),
-    "infinite": ("left,,,,,inf", 2, "period is 'inf'; wanted a finite number of s"),
-    "too large": ("left,1e300", 2, "x is '1e300'; wanted a finite number of m, at most 1000000 m"),
-    "no period": ("left\nleft,,,,,0", 3, "period is 0 s; wanted at least 0.005 s"),
-    "negative period": ("left,,,,,-0.5", 2, "period is -0.5 s; wanted at least 0.005 s"),
-    "negative lift": ("left,,,,,,-0.1", 2, "lift is -0.1 m; wanted at least 0 m"),
-    "a cell too many": ("left,,,,,,,,,,,,,0", 2, "has 14 cells; wanted at most 13"),
-    "both with a foothold": ("both,0.2", 2, "x is '0.2', but no foot moves; wanted it empty"),
-    "both with a lift": ("both,,,,,,0.1", 2, "lift is '0.1', but no foot moves; wanted it empty"),
-    "no step": ("# nothing", 1, "no step follows the header; wanted a line for each step"),
-    "box without a number": ("left\n# box 1 2 3 0 1 1", 3, "6 numbers; wanted `# box x y z yaw length width height`"),
-    "box of words": ("left\n# box 1 2 3 0 1 wide 1", 3, "box width is 'wide'; wanted a finite number of m"),
-    "box without a size": ("left\n# box 1 2 3 0 1 0 1", 3, "box width is 0 m; wanted at least 0.001 m"),
-    "box of negative size": ("# box 1 2 3 0 1 1 -1\nleft", 2, "box height is -1 m; wanted at least 0.001 m"),
-    "box around a foot": ("left,0.2\n# box 0 0.1 0 0 0.1 0.1 0.1", 3, "where the left foot starts"),
-    # hip 1.4 cm behind the middle, at 0.675 m: sqrt(0.414^2 + 0.635^2) m = 0.758 m to the ankle, allowed are 0.74 m
-    "too far": ("left,0.8", 2, "the left foot is 1.8 cm out of reach at the end of the step, its ankle 0.758 m"),
-    "trunk too far": ("both,,,,,1,,,,0.9", 2, "the right foot is 4.5 cm out of reach at the end of the step"),
-    "swung too high": ("left,,,,,0.4,0.4", 2, "the left foot is 10.9 cm out of reach 0.20 s into the step"),
-    "turned too far": ("left,,,,0.9,,,,,,,,0", 2, "turned 6.6 deg too far at the end of the step; wanted -45.0 deg"),
-    "on the other foot": ("left,0.1,-0.08", 2, "overlaps the right foot by 6.0 cm"),
-    "in the air": ("left,0.1,0.1,0.05", 2, "its sole's 4 corners the ground is up to 5.0 cm below z = 0.05 m"),
-    "under the ground": ("left,0.1,0.1,-0.05", 2, "5.0 cm under the ground; wanted z = 0 m"),
-    "inside a box": ("# box 0.3 0.1 0 0 0.4 0.2 0.1\nleft,0.2,0.1,0", 3, "box of line 2; wanted it on top, z = 0.1 m"),
-    "heel over an edge": ("# box 0.3 0 0 0 0.2 0.4 0.1\nleft,0.25", 3, "in the air: under 2 of its sole's 4 corners"),
-    "heel over an edge under a roof": (
-        "# box 0.3 0 0 0 0.2 0.4 0.1\n# box 0 0 1 0 2 2 0.1\nleft,0.25,,0.1", 4, "in the air: under 2 of its sole"
-    ),
-    "toes in a riser": ("# box 0.3 0 0 0 0.2 0.4 0.1\nleft,0.15", 3, "inside the box of line 2"),
-    "a pole under the sole": ("# box 0.2 0.1 0 0 0.02 0.02 0.1\nleft,0.2,0.1,0", 3, "inside the box of line 2"),
-    "under a low roof": ("# box 0.3 0.1 0.02 0 0.4 0.1 0.1\nleft,0.3,0.1,0", 3, "inside the box of line 2"),
-    "over the edge when turned": ("# box 0.2 0.1 0 0 0.16 0.1 0.05\nleft,0.2,0.1,,0.3", 3, "in the air: under 4"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("rows, line, words", WRONG.values(), ids=WRONG.keys())
-def test_what_is_wrong_is_named_with_its_line(rows: str, line: int, words: str) -> None:
-    found = problems(HEADER + rows)
-    assert any(words in p for p in found), found
-    assert all(p.startswith(f"walk.csv:{line}: ") for p in found), found
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        # within a hair of what the list above refuses
-        "left,0.68",
-        "left,,,,,0.4,0.28",
-        "left,,,,0.78,,,,,,,,0",
-        "left,0,0",  # sole beside sole
-        "left,0.1,0.1,0.0009",
-        "both,,,,,1,,,,0.85",
-        "# box 0.2 0.1 0 0 0.16 0.1 0.05\nleft,0.2,0.1",  # every corner on an edge
-        "# box 0.2 0.1 0 0.3 0.16 0.1 0.05\nleft,0.2,0.1,,0.3",
-        "left,0,-0.0009",
-        "# box 0.28 0.1 0 0 0.16 0.1 0.05\nleft,0.12,0.1,0",  # toes at a riser
-        "# box 0.2791 0.1 0 0 0.16 0.1 0.05\nleft,0.12,0.1,0",
-        "# box 0.3 0.1 0.5 0 0.4 0.1 0.1\nleft,0.3,0.1,0",  # under a high roof
-        "# box 0.15 0.1 0 0 0.1 0.2 0.05\n# box 0.25 0.1 0 0 0.1 0.2 0.05\nleft,0.2",  # over a joint of two boxes
-        "# box 0.2 0.1 -0.2 0 0.4 0.1 0.1\nleft,0.2,0.1",  # buried
-        "left,,,,,0.005\nboth\nleft,,,,,,0",
-    ],
-)
-def test_what_is_only_just_right_passes(rows: str) -> None:
-    assert parse(rows).steps
-
-
-def line_numbers(found: list[str]) -> list[int]:
-    return [int(p.split(":")[1]) for p in found]
-
-
 def test_all_problems_are_listed_by_line() -> None:
     rows = "lfet\nleft,0.1,one\nright,x,,,,-1,-1\nleft,0.1,0.1\nright,0.1,-0.1\nleft,2\nboth\nright,0.2,,0.1\n"
     assert line_numbers(problems(HEADER + rows)) == [2, 3, 4, 4, 4, 7, 7, 9, 9]
@@ -374,40 +235,6 @@ def test_nothing_is_said_of_places_that_depend_on_an_unread_cell() -> None:
     assert line_numbers(problems(HEADER + "lfet,0.3,0.1\nright,0.6,-0.1\nright,0.8,-0.1")) == [2]
     # but of places that are known again
     assert line_numbers(problems(HEADER + "left,x\nleft,0.1,0.1,0.05\nright,1,-0.1")) == [2, 3, 4, 4]
-
-
-def test_rectangles_at_an_angle_are_apart_where_only_an_edge_of_one_tells() -> None:
-    square = footsteps.Box(0, 0, 0, 0, 1, 1, 1).corners
-    diamond = footsteps.Box(0.9, 0.9, 0, math.pi / 4, 1, 1, 1).corners
-    apart = 0.9 * math.sqrt(2) - math.sqrt(0.5) - 0.5
-    assert footsteps._overlap(square, diamond) == pytest.approx(-apart)
-    assert footsteps._overlap(diamond, square) == pytest.approx(-apart)
-    assert footsteps._overlap(square, footsteps.Box(0.9, 0, 0, 0.0, 1, 1, 1).corners) == pytest.approx(0.1)
-
-
-def test_a_way_back_into_reach_is_no_problem_of_its_line() -> None:
-    assert line_numbers(problems(HEADER + "left,0.9\nboth,,,,,9\nleft,0.2\nright,0.2")) == [2, 2]
-
-
-def test_of_a_step_out_of_reach_the_end_is_named_even_if_it_was_farther_on_the_way() -> None:
-    found = problems(HEADER + "left,0.3,0.1,0,0,0.5,0.6,0,0,0.85")
-    assert [p for p in found if "left foot is 5.4 cm out of reach at the end of the step" in p], found
-
-
-def test_headers() -> None:
-    start = "walk.csv:1: "
-    lines = problems(HEADER.replace("trunk_z", "trunkz") + "left")
-    assert lines[0] == f"{start}unknown column 'trunkz'; did you mean 'trunk_z'?"
-    assert lines[1] == f"{start}the header lacks trunk_z; wanted {HEADER.strip()}"
-    assert problems(HEADER.replace(",yaw", "") + "left") == [f"{start}the header lacks yaw; wanted {HEADER.strip()}"]
-    assert problems(HEADER.replace("\n", ",lift\n") + "left") == [
-        f"{start}column 'lift' stands in the header 2 times; wanted it once"
-    ]
-    assert problems("left,0.2,0.1\nright,0.2") == [f"{start}is not the header; wanted {HEADER.strip()}"]
-    assert problems("\n \n# a comment\n") == [
-        f"walk.csv: is empty; wanted the header {HEADER.strip()} and a line for each step"
-    ]
-    assert problems("") == problems("\n")
 
 
 def test_files(tmp_path: Path) -> None:
@@ -501,18 +328,3 @@ def test_a_jump_moves_both_feet_at_once_about_their_middle() -> None:
     flight = planner.command(jump, np.float64(0.15))
     assert flight.target.ankle_positions[:, 2] == pytest.approx([0.11, 0.11]) and flight.timer == pytest.approx([0.15, 0.15])
     np.testing.assert_allclose(spot.end.ankle_positions, landing, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("rows", "line", "words"),
-    [
-        ("left up,0.1", 2, "z is empty; wanted the height at which the foot is held"),
-        ("left up,0.1,,0", 2, "the left foot is not up, z = 0 m over ground at 0 m"),
-        ("left up,,,0.1\nright,0.1", 3, "the left foot is in the air; wanted it down before the other one steps"),
-        ("left up,,,0.1\nright up,,,0.1", 3, "the left foot is in the air"),
-        ("jump,0.3,,0.1", 2, "the left foot stands in the air"),
-        ("up,0.1", 2, "wanted left, right, left up, right up, jump or both"),
-    ],
-)
-def test_what_feet_in_the_air_cannot_do(rows: str, line: int, words: str) -> None:
-    assert any(f"walk.csv:{line}: " in p and words in p for p in problems(HEADER + rows))

@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from walks import HEADER
 
 from bipedtrack import footsteps, planner, plans, rotations, tasks, terrain
 from bipedtrack.nodes import Nodes
@@ -27,7 +27,6 @@ CASES = {
 }
 ALL_CASES = pytest.mark.parametrize("case", CASES)
 
-HEADER = "foot,x,y,z,yaw,period,lift,trunk_x,trunk_y,trunk_z,trunk_roll,trunk_pitch,trunk_yaw\n"
 BOXES = """# box 0.9 0.05 0 0.3 0.4 0.6 0.02
 # box -0.8 0.4 0.1 0 0.3 0.2 0.5
 """
@@ -50,15 +49,6 @@ class Laid(NamedTuple):
 
 def at(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
-
-
-@pytest.fixture(scope="module")
-def unoptimised() -> Iterator[None]:
-    """Compiles in half the time what runs only once."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Recordings in MJX and MuJoCo C against a clock, kinematics, forces and a control loop of their own, and each other."""
 
 import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from traces import by_mujoco
 
 from bipedtrack import (
     control,
@@ -26,6 +26,7 @@ from bipedtrack import (
     terrain,
 )
 from bipedtrack import robot as robots
+from bipedtrack.disturbances import Hooks
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.trace import Trace
 
@@ -38,14 +39,7 @@ KINDS = (*["stand"] * 6, *["walk"] * 6, "stairs", "walk")
 TASK_STEPS = 6
 SIZES = (terrain.STAIR_BOX,) * terrain.STAIR_BOXES
 ROLL = math.radians(50)  # of a trunk that cannot be held up
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_compile() -> Iterator[None]:
-    """These programs run a few times only."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+pytestmark = pytest.mark.usefixtures("unoptimised")
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +113,7 @@ def in_c(recorders: Recorders, plan: plans.Plan) -> InC:
         forces.append([data.actuator_force.copy() for data in datas])
         return targets
 
-    trace = recorders.mujoco(plan, SIZES, SECONDS, before_step=look)
+    trace = recorders.mujoco(plan, SIZES, SECONDS, hooks=Hooks(before_step=look))
     return InC(trace, np.array(forces[1:]).swapaxes(0, 1))
 
 
@@ -155,19 +149,6 @@ def wanted(plan: plans.Plan) -> list[planner.Command]:
     return [stacked(commands(plan, i)) for i in range(len(KINDS))]
 
 
-def measured(model: mujoco.MjModel, states: np.ndarray) -> Nodes:
-    """The nodes at qpos (k, 19) by MuJoCo's own kinematics."""
-    data, found = mujoco.MjData(model), []
-    feet = [data.body(name) for name in ("left_foot", "right_foot")]
-    for qpos in states:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        yaws = [math.atan2(foot.xmat[3], foot.xmat[0]) for foot in feet]
-        trunk = data.body("trunk")
-        found.append(Nodes(trunk.xpos.copy(), trunk.xquat.copy(), np.array([f.xpos for f in feet]), np.array(yaws)))
-    return stacked(found)
-
-
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs(np.angle(np.exp(1j * (a - b))))
 
@@ -178,7 +159,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test_an_episode_starts_on_its_first_command(
     recorded: Trace, wanted: list[planner.Command], mj_model: mujoco.MjModel
 ) -> None:
-    real = measured(mj_model, recorded.qpos[:, 0])
+    real = by_mujoco(mj_model, recorded.qpos[:, 0])
     begin = stacked([jax.tree.map(lambda a: a[0], command.target) for command in wanted])
     np.testing.assert_allclose(real.ankle_positions, begin.ankle_positions, atol=1e-5)
     np.testing.assert_allclose(real.trunk_position, begin.trunk_position, atol=1e-5)
@@ -219,7 +200,7 @@ def test_a_command_stands_still_where_its_targets_do(recorded: Trace, plan: plan
 def test_measured_nodes_are_those_of_the_recorded_state(recorded: Trace, mj_model: mujoco.MjModel) -> None:
     for i in range(len(KINDS)):
         at = np.flatnonzero(recorded.alive[i])[::20]
-        real, found = measured(mj_model, recorded.qpos[i, at]), Nodes(*(part[i, at] for part in recorded.measured))
+        real, found = by_mujoco(mj_model, recorded.qpos[i, at]), Nodes(*(part[i, at] for part in recorded.measured))
         np.testing.assert_allclose(found.trunk_position, real.trunk_position, atol=1e-5)
         np.testing.assert_allclose(found.trunk_orientation, real.trunk_orientation, atol=1e-5)
         np.testing.assert_allclose(found.ankle_positions, real.ankle_positions, atol=1e-5)
@@ -233,7 +214,7 @@ def test_a_frame_of_misalignment_shows(wanted: list[planner.Command], robot: rob
     joints = [kinematics.inverse(robot, *ankles_in_trunk_frame(one)) for one in each]
     qpos = np.array([[*one.trunk_position, *one.trunk_orientation, *q] for one, q in zip(each, joints, strict=True)])
     twelve = np.zeros((1, 60, 12))
-    nodes = [Nodes(*(part[None] for part in state)) for state in (command.target, measured(mj_model, qpos))]
+    nodes = [Nodes(*(part[None] for part in state)) for state in (command.target, by_mujoco(mj_model, qpos))]
     still, up = np.zeros((1, 60), bool), np.ones((1, 60), bool)
     states = qpos[None], np.zeros((1, 60, 18))
     exact = Trace(np.arange(60) * DT, *states, *nodes, command.timer[None], still, *[twelve] * 3, twelve[..., :2], up)
@@ -315,7 +296,9 @@ def test_when_all_have_fallen_the_trace_keeps_its_length(
         return targets
 
     mjx = engine == "mjx"
-    fallen = recorders.mjx(rolled, SECONDS) if mjx else recorders.mujoco(rolled, SIZES, SECONDS, before_step=count)
+    fallen = (
+        recorders.mjx(rolled, SECONDS) if mjx else recorders.mujoco(rolled, SIZES, SECONDS, hooks=Hooks(before_step=count))
+    )
     assert len(recorders.compiled) == compiled  # for the first plan, but not anew
     # MJX looks every second, C at every step
     stopped = 200 if mjx else len(ticks)
@@ -432,8 +415,8 @@ def test_hooks_act(first: policy.Policy, plan: plans.Plan) -> None:
         qpos[:, 7:] = 0.01 * tick
         return qpos, qvel
 
-    hooks = {"model_of": model_of, "before_step": before_step, "observed": observed}
-    found = recording.mujoco_recorder(controls)(some, SIZES, 0.2, converged=True, **hooks)
+    hooks = Hooks(model_of, before_step, observed)
+    found = recording.mujoco_recorder(controls)(some, SIZES, 0.2, converged=True, hooks=hooks)
     assert ticks == [(name, tick) for tick in range(40) for name in ("observed", "before_step")]
     # each episode has its own model, of which MuJoCo has derived what follows from the masses
     assert len({id(model) for model in models}) == 3

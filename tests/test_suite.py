@@ -6,13 +6,13 @@ import itertools
 import math
 import pathlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import jax
 import numpy as np
 import pytest
 
-from bipedtrack import planner, plans, suite, tasks
+from bipedtrack import planner, plans, scripts, suite, tasks
 from bipedtrack.robot import Robot
 from bipedtrack.suite import Batch, Level
 
@@ -28,16 +28,13 @@ Draw = Callable[..., Batch]
 
 
 @pytest.fixture(scope="module")
-def draw(robot: Robot) -> Iterator[Draw]:
-    """Draws a task's batch: draw(name, episodes=18, seconds=72, seed=7, **ranges). Compiles in half the time."""
+def draw(robot: Robot, unoptimised: None) -> Draw:
+    """Draws a task's batch: draw(name, episodes=18, seconds=72, seed=7, **ranges)."""
 
     def draw(name: str, episodes: int = EPISODES, seconds: float = LONGEST, seed: int = SEED, **ranges: tuple) -> Batch:
         return suite.batch(name, tasks.Ranges()._replace(**ranges), robot, episodes, seconds, seed)
 
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield draw
-    jax.config.update("jax_disable_most_optimizations", before)
+    return draw
 
 
 @pytest.fixture(scope="module")
@@ -378,7 +375,7 @@ def written(path: pathlib.Path) -> tuple[list[dict[str, str]], list[list[float]]
 
 @pytest.mark.parametrize("name", ["obstacles", "composite"])
 def test_a_script_is_the_same_in_every_episode_and_as_it_is_written(name: str, robot: Robot) -> None:
-    rows, boxes = written(suite.script_path(name))
+    rows, boxes = written(scripts.ready()[name])
     batch = suite.batch(name, tasks.Ranges(), robot, 3, 10.0, SEED)
     steps = batch.plan.steps
     assert steps.period.shape == (3, len(rows) + 1)  # and at last the end is held

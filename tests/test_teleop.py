@@ -7,7 +7,7 @@ import re
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import malformed
 import numpy as np
@@ -15,6 +15,7 @@ import pytest
 
 from bipedtrack import footsteps, kinematics, packets, policy, teleop
 from bipedtrack.packets import Packet
+from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
 from bipedtrack.teleop import Teleoperation
 
@@ -76,18 +77,22 @@ def walk(robot: Robot) -> footsteps.Script:
 # Streams
 
 
-@pytest.mark.parametrize(("rate", "form"), [(50, "target"), (100, "target"), (50, "everything"), (100, "everything")])
-def test_a_streamed_walk_walks_its_distance(
-    driven: Teleoperation, send: socket.socket, robot: Robot, walk: footsteps.Script, rate: int, form: str
-) -> None:
-    every = round(1 / (rate * DT))
-    for tick, command in enumerate(footsteps.commands(walk, DT)):
+def stream(driven: Teleoperation, send: socket.socket, commands: Iterable[Command], every: int, form: str) -> None:
+    """Sends the targets, or everything, of one in `every` commands while the robot is driven."""
+    for tick, command in enumerate(commands):
         if tick % every == 0:
             packet = Packet(tick, tick * DT, command.target)
             if form == "everything":
                 packet = packet._replace(rates=command.rates, end=command.end, timer=command.timer)
             send.send(packets.encode(packet))
         driven.tick()
+
+
+@pytest.mark.parametrize(("rate", "form"), [(50, "target"), (100, "target"), (50, "everything"), (100, "everything")])
+def test_a_streamed_walk_walks_its_distance(
+    driven: Teleoperation, send: socket.socket, robot: Robot, walk: footsteps.Script, rate: int, form: str
+) -> None:
+    stream(driven, send, footsteps.commands(walk, DT), round(1 / (rate * DT)), form)
     ticks(driven, 1)
     assert driven.falls == 0 and not driven.receiver.refused.total()
     np.testing.assert_allclose(trunk(driven), STANDS + [0.5, 0, 0], atol=0.05)
@@ -100,13 +105,7 @@ def test_a_streamed_walk_walks_its_distance(
 def test_a_walk_whose_packets_stop_comes_to_stand(
     driven: Teleoperation, send: socket.socket, robot: Robot, walk: footsteps.Script, cut: float, form: str
 ) -> None:
-    for tick, command in enumerate(footsteps.commands(walk, DT, cut)):
-        if tick % 4 == 0:
-            packet = Packet(tick, tick * DT, command.target)
-            if form == "everything":
-                packet = packet._replace(rates=command.rates, end=command.end, timer=command.timer)
-            send.send(packets.encode(packet))
-        driven.tick()
+    stream(driven, send, footsteps.commands(walk, DT, cut), 4, form)
     ticks(driven, 3)
     assert driven.falls == 0 and driven.receiver.follower.state == "standing"
     np.testing.assert_allclose(kinematics.measure(robot, driven.data.qpos).ankle_positions[:, 2], 0.04, atol=0.01)

@@ -1,13 +1,16 @@
-"""Stairs: the boxes by hand, under the footholds, and out of the way of the swinging feet."""
+"""Stairs: the boxes by hand, under the footholds, and out of the way of the swinging feet. Boxes anywhere."""
 
 import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 import pytest
+from walks import parse
 
+from bipedtrack import robot as robots
 from bipedtrack import tasks, terrain
 from bipedtrack.robot import Robot
 from bipedtrack.terrain import STAIR_BOX, Stairs, stair_boxes
@@ -179,3 +182,32 @@ def test_at_full_difficulty_a_sole_in_a_few_hundred_scrapes_an_edge(
     from_boxes, _ = clearances(robot, drawn, window(drawn))
     assert from_boxes.min() > -0.015
     assert (from_boxes < -1e-4).mean() < 0.005
+
+
+# Boxes anywhere
+
+
+def test_boxes_stand_in_the_simulator_where_the_script_says() -> None:
+    script = parse("# box 0.6 0.1 0.3 0.5 0.4 0.3 0.2\nleft")
+    box = script.boxes[0]
+    model = robots.build_model("ranger_max", boxes=[box.size for box in script.boxes])
+    data = mujoco.MjData(model)
+    data.mocap_pos[0], data.mocap_quat[0] = box.position, box.orientation
+    mujoco.mj_kinematics(model, data)
+    geom = model.geom("box_0").id
+    local = model.geom_size[geom] * [[1, 1, -1], [-1, 1, -1], [-1, -1, 1]]
+    corners = data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
+    np.testing.assert_allclose(corners[:, :2], box.corners[:3], atol=1e-12)
+    np.testing.assert_allclose(corners[:, 2], [0.3, 0.3, 0.5], atol=1e-12)
+    # length along its own x, which points 0.5 rad to the left
+    along = (corners[0] - corners[1])[:2]
+    np.testing.assert_allclose(along, [0.4 * math.cos(0.5), 0.4 * math.sin(0.5)], atol=1e-12)
+
+
+def test_rectangles_at_an_angle_are_apart_where_only_an_edge_of_one_tells() -> None:
+    square = terrain.Box(0, 0, 0, 0, 1, 1, 1).corners
+    diamond = terrain.Box(0.9, 0.9, 0, math.pi / 4, 1, 1, 1).corners
+    apart = 0.9 * math.sqrt(2) - math.sqrt(0.5) - 0.5
+    assert terrain.overlap(square, diamond) == pytest.approx(-apart)
+    assert terrain.overlap(diamond, square) == pytest.approx(-apart)
+    assert terrain.overlap(square, terrain.Box(0.9, 0, 0, 0.0, 1, 1, 1).corners) == pytest.approx(0.1)

@@ -8,19 +8,6 @@ import reports
 from reports import MOVES, drop, put, summaries
 
 from bipedtrack import verdicts
-from bipedtrack.robot import Robot
-
-
-@pytest.fixture(scope="module")
-def whole(robot: Robot) -> dict[str, Any]:
-    """A record of two policies on three engines, with robustness."""
-    return reports.make(robot)
-
-
-@pytest.fixture
-def record(whole: dict[str, Any]) -> dict[str, Any]:
-    """The same for a test to change."""
-    return reports.copied(whole)
 
 
 def verdict(record: dict[str, Any], about: str, claim: str, policy: str = "ik") -> dict[str, Any]:
