@@ -9,6 +9,7 @@ COMMANDS = {
     "export": "write the policy of a training run to one file that numpy alone can run",
     "simulate": "drive the robot through a footstep script in MuJoCo C",
     "teleop": "drive the robot by node targets that come over UDP",
+    "curves": "draw the learning curves of training runs side by side",
     "evaluate": "measure the tracking error of every step, on two simulators",
     "play": "drive the robot in a browser",
     "video": "film a policy on a footstep script",

@@ -24,7 +24,7 @@ LADDER = """
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite pictures
     training evaluation sheets comparisons report
-    doctor train export evaluate simulate video teleop drive realtime scene page play __main__
+    doctor train curves export evaluate simulate video teleop drive realtime scene page play __main__
 """.split()
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
