@@ -51,10 +51,12 @@ class _Random:
     break_share: float = 0.0  # share of the episodes that pause or close up every few task steps
 
 
-_RANDOM = {
+_UNIFORM = {"swing_ease": (0.0, 0.0, 0.0)}  # Bezier curves as the paper may have run through them
+_FORWARD = {"walk_step": (0.03, 0.03, 0.25)}
+_BASIC = {
     "stand": _Random("stand"),
     "squat": _Random("squat"),
-    "walk-forward": _Random("walk", {"walk_step": (0.03, 0.03, 0.25)}),
+    "walk-forward": _Random("walk", _FORWARD),
     "walk-backward": _Random("walk", {"walk_step": (-0.15, -0.03, -0.03)}),
     "sidle-left": _Random("sidle", {"sidle_step": (0.02, 0.02, 0.12)}),
     "sidle-right": _Random("sidle", {"sidle_step": (-0.12, -0.02, -0.02)}),
@@ -63,13 +65,18 @@ _RANDOM = {
     "stairs-up": _Random("stairs", down_share=0.0),
     "stairs-down": _Random("stairs", down_share=1.0),
     "wander": _Random("wander"),
+}
+_VARIANTS = {
+    "walk-forward-uniform": _Random("walk", _FORWARD | _UNIFORM),
+    "stairs-up-uniform": _Random("stairs", _UNIFORM, down_share=0.0),
     "walk-breaks": _Random("walk", break_share=1.0),
     "stairs-breaks": _Random("stairs", break_share=1.0),
 }
+_RANDOM = _BASIC | _VARIANTS
 BEYOND = ("one-legged-stance", "hop", "long-jump", "kick", "crouch-walk", "cross-step", "sway", "stepping-stones")
 """Scripts of kinds that Table II does not have."""
 SCRIPTS = ("obstacles", "composite", *BEYOND)
-MOVING = tuple(name for name, what in _RANDOM.items() if name != "stand" and not what.break_share)
+MOVING = tuple(name for name in _BASIC if name != "stand")
 HOLDS = tuple(f"hold-{name}" for name in MOVING)
 LONG_HOLDS = tuple(f"hold-60s-{name}" for name in MOVING)
 TASKS = (*_RANDOM, *HOLDS, *LONG_HOLDS, *SCRIPTS)
@@ -98,6 +105,7 @@ def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int
     if what.kind == "stairs":
         narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
+    words += "; swings run through uniformly" if "swing_ease" in what.narrowed else ""
     words += "; a pause or the feet together every few task steps" if what.break_share else ""
     levels = _grid(episodes) if what.kind == "stairs" else _thirds(what.kind, plan)
     return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words, levels)

@@ -80,7 +80,15 @@ def moving(plan: plans.Plan) -> np.ndarray:
 
 def test_every_task_has_a_name_of_its_own() -> None:
     assert len(suite.TASKS) == len(set(suite.TASKS))
-    more = {"wander", "walk-breaks", "stairs-breaks", "hold-wander", "hold-60s-wander"}
+    more = {
+        "wander",
+        "walk-breaks",
+        "stairs-breaks",
+        "walk-forward-uniform",
+        "stairs-up-uniform",
+        "hold-wander",
+        "hold-60s-wander",
+    }
     assert set(suite.TASKS) == {*BASE, *HOLDS, *suite.BEYOND, *more, "obstacles", "composite"}
 
 
@@ -393,3 +401,10 @@ def test_a_script_is_the_same_in_every_episode_and_as_it_is_written(name: str, r
         known = [x, y, z + height / 2, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]
         np.testing.assert_allclose(pose, np.broadcast_to(known, pose.shape), atol=1e-12)
     assert batch.ranges == f"footstep script {name}.csv" and batch.levels == ()
+
+
+@pytest.mark.parametrize(("task", "ease"), [("walk-forward", 0.2), ("walk-forward-uniform", 0), ("stairs-up-uniform", 0)])
+def test_only_what_says_so_has_swings_that_are_run_through_uniformly(robot: Robot, task: str, ease: float) -> None:
+    drawn = suite.batch(task, tasks.Ranges(), robot, 4, 2.0, 0)
+    assert (drawn.plan.steps.ease >= ease - 1e-6).all() and (drawn.plan.steps.ease <= ease + 0.1 * (ease > 0) + 1e-6).all()
+    assert ("uniformly" in drawn.ranges) == (ease == 0)
