@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +96,29 @@ class Tab:
             time.sleep(0.2)
             return before if before == self.evaluate(script) else None
 
-        x, y = wait_until(at_rest)
+        pixel = wait_until(at_rest)
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            self._mouse(kind, pixel)
+
+    def drag(self, way: Sequence[tuple[float, float]], release: bool = True) -> None:
+        """Presses the mouse at the first pixel of a way and moves it along the others; without release it stays down."""
+        self._mouse("mouseMoved", way[0], "none")
+        time.sleep(0.3)  # what lies under the mouse lights up
+        self._mouse("mousePressed", way[0])
+        for pixel in way[1:]:
+            time.sleep(0.05)
+            self._mouse("mouseMoved", pixel)
+        if release:
+            self.release(way[-1])
+
+    def release(self, pixel: tuple[float, float]) -> None:
+        """Lets go of the mouse."""
+        self._mouse("mouseReleased", pixel)
+
+    def _mouse(self, kind: str, pixel: tuple[float, float], button: str = "left") -> None:
+        x, y = pixel
+        down = int(button == "left" and kind != "mouseReleased")
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=down, clickCount=1)
 
     def picture(self) -> bytes:
         """A PNG of what is seen."""

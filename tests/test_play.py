@@ -1,6 +1,7 @@
 """The page in a real browser, its handles, and what the command line refuses."""
 
 import io
+import math
 import os
 import re
 import signal
@@ -17,14 +18,14 @@ import pytest
 from chromium import Chromium, Tab, wait_until
 from PIL import Image
 
-from bipedtrack import footsteps, play
+from bipedtrack import footsteps, play, rotations
 from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
 from bipedtrack.steering import Steering
 
 pytest.importorskip("viser")
 from bipedtrack.page import Page  # noqa: E402
-from bipedtrack.scene import color_of, shape_of  # noqa: E402
+from bipedtrack.scene import OUT_OF_REACH_COLOR, color_of, shape_of  # noqa: E402
 
 
 def free_port() -> int:
@@ -78,10 +79,10 @@ def test_a_foothold_out_of_reach_turns_red_and_the_robot_goes_to_the_nearest(pag
     page._drag("foot", "start", page._place_foot, page._reaches_foot)
     handle.position = np.array([0.2, 0.12 if foot == 0 else -0.12, 0.0])
     page._drag("foot", "update", page._place_foot, page._reaches_foot)
-    assert tuple(page.scene._foot_plate.color) != (220, 30, 30)
+    assert tuple(page.scene._foot_plate.color) != OUT_OF_REACH_COLOR
     handle.position = np.array([3.0, 0.1 if foot == 0 else -0.1, 0.0])
     page._drag("foot", "update", page._place_foot, page._reaches_foot)
-    assert tuple(page.scene._foot_plate.color) == (220, 30, 30)
+    assert tuple(page.scene._foot_plate.color) == OUT_OF_REACH_COLOR
     page._drag("foot", "end", page._place_foot, page._reaches_foot)
     wait_until(lambda: page.clock.view.measured.ankle_positions[foot, 0] > 0.3)
     assert page.clock.view.mode is Mode.STEER
@@ -252,6 +253,76 @@ def test_a_push_moves_it(tab: Tab, page: Page) -> None:
     at = page.clock.view.qpos[1]
     tab.click("push")
     wait_until(lambda: page.clock.view.qpos[1] > at + 0.01)
+
+
+def is_red(picture: bytes, x: float, y: float) -> bool:
+    """Whether the pixel there has the colour of what is out of reach."""
+    red, green, blue = Image.open(io.BytesIO(picture)).convert("RGB").getpixel((round(x), round(y)))
+    return red > 1.5 * max(green, blue)
+
+
+def pixels(page: Page, points: np.ndarray) -> list[tuple[float, float]]:
+    """Where points (n, 3) of the drive's world, m, are seen: through the camera that the page tells of."""
+    (client,) = page._server.get_clients().values()
+    camera = client.camera
+    from_camera = rotations.to_matrix(camera.wxyz)  # x to the right, y down, z ahead
+    x, y, z = ((points + page.scene._world.position - camera.position) @ from_camera).T
+    height, width = camera.image_height, camera.image_width
+    share = height / 2 / math.tan(camera.fov / 2)
+    return list(zip(width / 2 + share * x / z, height / 2 + share * y / z, strict=True))
+
+
+def drag(tab: Tab, page: Page, at: np.ndarray, by: np.ndarray, release: bool = True) -> tuple[float, float]:
+    """Drags what is at a point of the drive's world, (3,) m, along a vector; the pixel where the mouse ends."""
+    way = pixels(page, at + np.linspace(0, 1, 12)[:, None] * by)
+    tab.drag(way, release)
+    return way[-1]
+
+
+@pytest.fixture
+def wide(tab: Tab) -> Iterator[Tab]:
+    """A window in which the panel leaves the handles free, once the robot is seen."""
+    wait_until(lambda: is_blue(tab.picture()).sum() > 100)
+    tab.call("Emulation.setDeviceMetricsOverride", width=900, height=500, deviceScaleFactor=1, mobile=False)
+    time.sleep(1.0)
+    yield tab
+    tab.call("Emulation.clearDeviceMetricsOverride")
+
+
+GRIP = np.array([0.053, 0.053, 0.0])  # m from a handle: the little square between two of its arrows
+
+
+@browser_tests
+def test_a_foothold_is_dragged_with_the_mouse(wide: Tab, page: Page) -> None:
+    assert page.clock.view.next_foot.foot == 0
+    drag(wide, page, page.scene.foot.position + GRIP, np.array([0.15, 0.0, 0.0]))
+    wait_until(lambda: page.clock.view.next_foot.foot == 1)
+    wait_until(lambda: not page.clock.view.prints)
+    assert page.clock.view.measured.ankle_positions[0, :2] == pytest.approx([0.15, 0.1], abs=0.03)
+    assert "moved" not in wide.text
+
+
+@browser_tests
+def test_a_foothold_dragged_out_of_reach_turns_red_and_is_moved(wide: Tab, page: Page) -> None:
+    end = drag(wide, page, page.scene.foot.position + GRIP, np.array([0.1, 0.7, 0.0]), release=False)
+    wait_until(lambda: tuple(page.scene._foot_plate.color) == OUT_OF_REACH_COLOR)
+    heel = page.scene.foot.position - [0.06, 0.0, 0.0]  # of the plate, where none of the arrows lies
+    wait_until(lambda: is_red(wide.picture(), *pixels(page, heel[None])[0]))
+    wide.release(end)
+    wait_until(lambda: "the left foothold was moved by" in wide.text)
+    wait_until(lambda: page.clock.view.next_foot.foot == 1)
+    wait_until(lambda: not page.clock.view.prints)
+    x, y, _ = page.clock.view.measured.ankle_positions[0]
+    assert 0.2 < math.dist((x, y), (0.0, 0.1)) < 0.36  # as far as steps go, and to that side
+    assert y > 0.3
+    assert page.clock.view.mode is Mode.STEER
+
+
+@browser_tests
+def test_the_trunk_is_dragged_with_the_mouse(wide: Tab, page: Page) -> None:
+    drag(wide, page, page.scene.trunk.position + [0.0, 0.0, 0.15], np.array([0.0, 0.0, -0.06]))
+    wait_until(lambda: page.clock.view.qpos[2] < 0.71)
+    assert page.clock.view.steering.trunk_height == pytest.approx(0.69, abs=0.01)
 
 
 def write(tab: Tab, page: Page, text: str) -> None:
