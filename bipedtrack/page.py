@@ -289,38 +289,35 @@ class Page:
         elif handle in self.scene.held:
             self.scene.mark(handle, reaches())
 
-    def _wanted_foothold(self) -> steering.Foothold:
-        return self.scene.foothold(self.clock.view.next_foot.foot)
+    # What is within reach is searched in the viewer's own thread, for it takes long: the drive goes on meanwhile.
+
+    def _wanted_foothold(self, view: View) -> steering.Foothold:
+        return self.scene.foothold(view.next_foot.foot)
 
     def _reaches_foot(self) -> bool:
-        wanted = self._wanted_foothold()
-        return not self._ask(lambda drive: drive.reaches(wanted))
+        view = self.clock.view
+        return not steering.problems(self._robot, view.boxes, view.step.end, self._wanted_foothold(view), view.steering)
 
     def _place_foot(self) -> None:
-        wanted = self._wanted_foothold()
-        boxes, end, asked = self._ask(lambda drive: (drive.boxes, drive.step.end, drive.steering))
-        # the search for the nearest foothold takes long; the robot does not wait for it
-        planned = steering.place(self._robot, boxes, end, wanted, asked)
-        if planned.step.swing.any():
-            end = planned.step.end
-            x, y, _ = end.ankle_positions[wanted.foot]
-            found = steering.Foothold(wanted.foot, float(x), float(y), float(end.ankle_yaws[wanted.foot]))
-            self._ask(lambda drive: drive.place(found))
+        view = self.clock.view
+        wanted = self._wanted_foothold(view)
+        planned = steering.place(self._robot, view.boxes, view.step.end, wanted, view.steering)
+        possible = planned.step.swing.any()
+        if possible:
+            self._ask(lambda drive: drive.place(steering.end_of(planned.step, wanted.foot)))
         if planned.note:
-            self._say(planned.note, wrong=not planned.step.swing.any())
+            self._say(planned.note, wrong=not possible)
 
-    def _wanted_trunk(self) -> Steering:
-        end, now = self._ask(lambda drive: (drive.step.end, drive.steering))
-        return steering.trunk_at(self._robot, end, self.scene.trunk.position, self.scene.trunk.wxyz, now)
+    def _wanted_trunk(self, view: View) -> Steering:
+        return steering.trunk_at(self._robot, view.step.end, self.scene.trunk.position, self.scene.trunk.wxyz, view.steering)
 
     def _reaches_trunk(self) -> bool:
-        wanted = self._wanted_trunk()
+        wanted = self._wanted_trunk(self.clock.view)
         return steering.clamped(wanted) == wanted
 
     def _place_trunk(self) -> None:
-        wanted = self._wanted_trunk()
-        boxes, end = self._ask(lambda drive: (drive.boxes, drive.step.end))
-        within, note = steering.lean(self._robot, boxes, end, wanted)
+        view = self.clock.view
+        within, note = steering.lean(self._robot, view.boxes, view.step.end, self._wanted_trunk(view))
         self._steer(**{name: value for name, value in within._asdict().items() if name.startswith("trunk")})
         if note:
             self._say(note)

@@ -54,8 +54,8 @@ def start(request: pytest.FixtureRequest) -> None:
 
 
 def at_rest(drive: Drive) -> None:
-    drive.steering = Steering()
     drive.reset(())
+    drive.steer(**Steering()._asdict())
 
 
 def x_of(page: Page) -> float:
