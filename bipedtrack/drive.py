@@ -150,7 +150,7 @@ class Drive:
                 return Planned(self.script.steps[self._line - 1])
             if self.loop:
                 self.run(self.script, loop=True)
-                return Planned(self.step)
+                return Planned(self.taken.pop())
             self._steer_on(f"{self.script.name}: the script is over")
         planned, self.wishes = self._following()
         return planned

@@ -395,3 +395,10 @@ def test_what_was_planned_ahead_is_taken_and_a_later_wish_voids_it(shipped: poli
         go(drive, 2.0)
     for mine, theirs in zip(ahead.taken, otherwise.taken, strict=True):
         assert max(np.abs(part).max() for part in nodes.difference(mine.end, theirs.end)) == 0.0
+
+
+def test_a_loop_is_written_down_once(drive: Drive) -> None:
+    script = footsteps.load(scripts.ready()["walk"], drive.robot)
+    drive.run(script, loop=True)
+    go(drive, footsteps.duration(script) + 0.1)
+    assert len(drive.taken) == 1
