@@ -41,6 +41,8 @@ _KEYS = """
 **Keys** (click into the picture first): **I** forward, **K** backward, **J** turn left, **L** turn right, **U** sidle left,
 **O** sidle right, **space** stop and hold, **B** push, **P** pause, **N** single step, **G** stand up, **R** reset.
 W A S D, the arrows and the mouse move the camera.
+
+**Drag** the arrows and the square at a foot to place it, those at the trunk to move it: red is out of reach.
 """
 
 
@@ -116,8 +118,10 @@ class Page:
     def _steer(self, **wishes: float) -> None:
         self._ask(lambda drive: drive.steer(**wishes))
 
-    def _button(self, label: str, request: Callable[[], Any], hint: str | None = None) -> None:
-        self._server.gui.add_button(label, hint=hint).on_click(lambda _: request())
+    def _button(self, label: str, request: Callable[[], Any], hint: str | None = None) -> viser.GuiButtonHandle:
+        button = self._server.gui.add_button(label, hint=hint)
+        button.on_click(lambda _: request())
+        return button
 
     # Panels
 
@@ -145,7 +149,7 @@ class Page:
             group = gui.add_button_group("", names)
             group.on_click(lambda event: moves[str(event.target.value)][1]())
         self._button("stop and hold", moves["stop and hold"][1])
-        self._button("stand up at the last foothold", lambda: self._ask(Drive.stand_up), "after a fall")
+        self._stand_up = self._button("stand up at the last foothold", lambda: self._ask(Drive.stand_up), "after a fall")
         self._button("reset", lambda: self._ask(Drive.reset), "back to the start")
         ground = gui.add_dropdown("ground", ("level", "stairs", "obstacles"))
         ground.on_update(lambda event: self._lay_out(str(event.target.value)))
@@ -225,7 +229,7 @@ class Page:
         with gui.add_folder("policy"):
             chosen = gui.add_dropdown("policy", tuple(self._policies))
             chosen.on_update(lambda event: self._use(str(event.target.value)))
-            feedback = gui.add_checkbox("feedback (off: inverse kinematics alone)", True)
+            feedback = gui.add_checkbox("feedback", True, hint="off: inverse kinematics alone")
             feedback.on_update(lambda event: self._ask(lambda drive: setattr(drive, "feedback", bool(event.target.value))))
 
     def _add_plot(self, title: str, labels: tuple[str, ...], names: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
@@ -331,7 +335,10 @@ class Page:
             f"**{view.mode.value}** at {view.time:.1f} s, {factor}; "
             f"a control step takes {pace.step_ms:.1f} ms, 99 %: {pace.step_p99_ms:.1f} ms"
         )
-        note = f"**{view.note}**" if view.mode is Mode.FALLEN else view.note
+        fallen = view.mode is Mode.FALLEN
+        if self._stand_up.disabled is fallen:
+            self._stand_up.disabled = not fallen
+        note = f"**{view.note}**" if fallen else view.note
         if self._note.content != note:
             self._note.content = note
         for name, slider in self._sliders.items():
