@@ -247,6 +247,54 @@ def test_a_button_makes_it_walk(tab: Tab, page: Page) -> None:
 
 
 @browser_tests
+def test_it_climbs_a_stair_and_stops_there(tab: Tab, page: Page) -> None:
+    """What the README tells a new user to do."""
+    tab.click("level")
+    tab.click("stairs")
+    wait_until(lambda: page.clock.view.boxes)
+    tab.click_at((200.0, 300.0))  # into the picture
+    tab.press("i")
+    wait_until(lambda: page.clock.view.measured.ankle_positions[:, 2].max() > 0.13)
+    tab.press(" ")
+    wait_until(lambda: not (page.clock.view.steering.moves or page.clock.view.prints))
+    began = page.clock.view.time
+    while page.clock.view.time < began + 5.0:
+        heights = page.clock.view.measured.ankle_positions[:, 2]
+        assert heights[0] == pytest.approx(heights[1], abs=0.01)
+        assert heights.min() > 0.13
+        time.sleep(0.1)
+    assert page.clock.view.mode is Mode.STEER
+    tab.click("stairs")
+    tab.click("level")
+    wait_until(lambda: not page.clock.view.boxes)
+
+
+@browser_tests
+def test_a_number_typed_beside_a_slider_is_steered(tab: Tab, page: Page) -> None:
+    tab.click("0.75")  # m, trunk height
+    tab.write("0.68")
+    wait_until(lambda: page.clock.view.steering.trunk_height == pytest.approx(0.68))
+    wait_until(lambda: page.clock.view.qpos[2] < 0.71)
+
+
+@browser_tests
+def test_after_a_fall_it_says_so_and_stands_up_again(tab: Tab, page: Page) -> None:
+    tab.click("Watch")
+    tab.click("feedback")
+    wait_until(lambda: not page.clock.ask(lambda drive: drive.feedback))
+    tab.click("Drive")
+    tab.click("forward")
+    wait_until(lambda: "stand up again at the last foothold, or reset" in tab.text)
+    tab.click("Watch")
+    tab.click("feedback")
+    wait_until(lambda: page.clock.ask(lambda drive: drive.feedback))
+    tab.click("Drive")
+    tab.click("stand up at the last foothold")
+    wait_until(lambda: page.clock.view.mode is Mode.STEER)
+    wait_until(lambda: page.clock.view.qpos[2] > 0.7)
+
+
+@browser_tests
 def test_a_push_moves_it(tab: Tab, page: Page) -> None:
     tab.click("Watch")
     wait_until(lambda: "impulse" in tab.text)
@@ -345,6 +393,26 @@ def test_a_bad_script_shows_its_error_and_a_good_one_runs_to_its_end(tab: Tab, p
     wait_until(lambda: "the script is over" in tab.text)
     assert x_of(page) == pytest.approx(0.15, abs=0.05)
     assert "script:1" not in tab.text
+
+
+@browser_tests
+def test_a_script_comes_from_a_file_and_a_drive_goes_into_one(
+    tab: Tab, browser: Chromium, page: Page, tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine.csv"
+    mine.write_text(f"{','.join(footsteps.COLUMNS)}\nleft,0.1\nright,0.1\n")
+    tab.click("Scripts")
+    tab.give(mine)
+    wait_until(lambda: page._text.value == mine.read_text())
+    tab.click("run")
+    wait_until(lambda: "the script is over" in tab.text)
+    tab.click("the drive so far as a script")
+    wait_until(lambda: page._text.value != mine.read_text())
+    tab.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    tab.click("save")
+    saved = tmp_path / "script.csv"
+    wait_until(lambda: saved.is_file() and saved.read_text() == page._text.value)
+    assert len(footsteps.load(saved, robots.load()).steps) >= 2
 
 
 @browser_tests
