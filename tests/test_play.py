@@ -21,6 +21,7 @@ from PIL import Image
 from bipedtrack import footsteps, play, rotations
 from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
+from bipedtrack.realtime import HISTORY_SECONDS
 from bipedtrack.steering import Steering
 
 pytest.importorskip("viser")
@@ -446,11 +447,15 @@ def test_nothing_failed_and_nothing_came_from_outside(tab: Tab, port: int) -> No
 
 @browser_tests
 def test_control_steps_are_short_under_a_busy_page(tab: Tab, page: Page, capsys: pytest.CaptureFixture[str]) -> None:
+    tab.click("Watch")
     page._steer(ahead=1.0)
-    time.sleep(3.0)
+    time.sleep(HISTORY_SECONDS)
     pace = page.clock.pace
     with capsys.disabled():
-        print(f"\ncontrol step: {pace.step_ms:.2f} ms, 99 %: {pace.step_p99_ms:.2f} ms, of work {pace.work_p99_ms:.2f} ms")
+        print(
+            f"\ncontrol step: {pace.step_ms:.2f} ms, 99 %: {pace.step_p99_ms:.2f} ms, of work {pace.work_p99_ms:.2f} ms, "
+            f"late by {pace.late_p99_ms:.2f} ms; {pace.factor:.2f} x real time"
+        )
     # the browser draws in software and other programs run: only the work can be held to the 5 ms of an idle machine
     assert pace.work_p99_ms < 5.0
     assert pace.step_ms < 5.0
