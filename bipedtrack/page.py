@@ -179,7 +179,7 @@ class Page:
         self._loop = gui.add_checkbox("loop", False)
         self._button("run", self._run_script)
         self._button("stop and hold ", lambda: self._ask(Drive.stop))
-        gui.add_button("save").on_click(lambda event: self._save(event, self._text.value, "script.csv"))
+        gui.add_button("save").on_click(self._save)
         gui.add_button("the drive so far as a script").on_click(lambda _: self._write_down())
         upload = gui.add_upload_button("load a file", mime_type=".csv,text/csv,text/plain")
         self._problems = gui.add_markdown("")
@@ -207,9 +207,10 @@ class Page:
         if written is not None:
             self._text.value = written
 
-    def _save(self, event: Any, text: str, name: str) -> None:
+    def _save(self, event: Any) -> None:
+        """The editor's text as a file, to the one who asked."""
         if event.client is not None:
-            event.client.send_file_download(name, text.encode(), save_immediately=True)
+            event.client.send_file_download("script.csv", self._text.value.encode(), save_immediately=True)
 
     def _add_watching(self) -> None:
         """Plots, push, time, policy."""
@@ -338,7 +339,9 @@ class Page:
         fallen = view.mode is Mode.FALLEN
         if self._stand_up.disabled is fallen:
             self._stand_up.disabled = not fallen
-        note = f"**{view.note}**" if fallen else view.note
+        # never without words, or all that stands below would move away from under the mouse
+        note = view.note or ("walking" if view.steering.moves or view.prints else "holding")
+        note = f"**{note}**" if fallen else note
         if self._note.content != note:
             self._note.content = note
         for name, slider in self._sliders.items():
@@ -349,9 +352,8 @@ class Page:
     def _show_plots(self) -> None:
         history: list[Sample] = list(self.clock.history)[::2]
         times = np.array([sample.time for sample in history])
-        if len(times) < 2 or (np.diff(times) < 0).any():  # after a reset, only what came after it
-            first = int(np.flatnonzero(np.diff(times) < 0)[-1]) + 1 if len(times) > 1 else 0
-            history, times = history[first:], times[first:]
+        for reset in np.flatnonzero(np.diff(times) < 0)[-1:] + 1:  # only what came after it
+            history, times = history[reset:], times[reset:]
         for plot, names in self._plots:
             if len(times):
                 plot.data = (times, *(np.array([getattr(sample, name) for sample in history]) for name in names))
