@@ -69,6 +69,11 @@ class Tab:
         """The value of a JavaScript expression."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
+    def draw(self) -> None:
+        """Waits until all that the page knows by now has been drawn."""
+        twice = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+        self.call("Runtime.evaluate", expression=twice, awaitPromise=True)
+
     @property
     def text(self) -> str:
         """What can be read on the page."""
@@ -119,10 +124,10 @@ class Tab:
     def drag(self, way: Sequence[tuple[float, float]], release: bool = True) -> None:
         """Presses the mouse at the first pixel of a way and moves it along the others; without release it stays down."""
         self._mouse("mouseMoved", way[0], "none")
-        time.sleep(0.3)  # what lies under the mouse lights up
+        self.draw()  # what lies under the mouse lights up
         self._mouse("mousePressed", way[0])
         for pixel in way[1:]:
-            time.sleep(0.05)
+            self.draw()
             self._mouse("mouseMoved", pixel)
         if release:
             self.release(way[-1])

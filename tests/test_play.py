@@ -329,11 +329,14 @@ def drag(tab: Tab, page: Page, at: np.ndarray, by: np.ndarray, release: bool = T
 
 
 @pytest.fixture
-def wide(tab: Tab) -> Iterator[Tab]:
-    """A window in which the panel leaves the handles free, once the robot is seen."""
+def wide(tab: Tab, page: Page) -> Iterator[Tab]:
+    """A window in which the panel leaves the handles free, once the robot is seen at the start."""
     wait_until(lambda: is_blue(tab.picture()).sum() > 100)
     tab.call("Emulation.setDeviceMetricsOverride", width=900, height=500, deviceScaleFactor=1, mobile=False)
-    time.sleep(1.0)
+    (client,) = page._server.get_clients().values()
+    wait_until(lambda: (client.camera.image_width, client.camera.image_height) == (900, 500))
+    wait_until(lambda: np.allclose(page.scene.foot.position[:2], [0.0, 0.1]))
+    tab.draw()
     yield tab
     tab.call("Emulation.clearDeviceMetricsOverride")
 
