@@ -18,7 +18,7 @@ from bipedtrack.footsteps import Box, Script
 from bipedtrack.nodes import NodeErrors, Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import LEGS
-from bipedtrack.steering import Foothold, Planned, Steering
+from bipedtrack.steering import Foothold, Planned, Steering, Wishes
 
 # When a robot counts as fallen, as in training (env.EnvConfig).
 FALL_TILT_DEG = 60.0
@@ -27,6 +27,7 @@ LOST_ANKLE = 0.5  # m, an ankle off its target
 _LYING = 0.2  # m, height of a trunk that has come to lie
 PUSH_SECONDS = 0.1
 PUSH_LIMIT = 200.0  # N s
+_STILL = {"ahead": 0.0, "aside": 0.0, "turn": 0.0}
 _FARTHEST_PRINTS = 12  # footholds of a script that are shown ahead
 
 
@@ -53,7 +54,11 @@ class View(NamedTuple):
     boxes: tuple[Box, ...]
     prints: tuple[Foothold, ...]  # the foothold under way and those that follow
     next_foot: Foothold  # what `place` would move
-    next_trunk: tuple[np.ndarray, np.ndarray]  # (3,) m and (4,): where the trunk is asked to be over the feet
+    step: TaskStep  # under way
+
+
+# What follows among these boxes a task step that ended here, with these wishes?
+_Question = tuple[tuple[Box, ...], Nodes, Wishes]
 
 
 def fallen(qpos: np.ndarray, qvel: np.ndarray, errors: NodeErrors) -> bool:
@@ -80,15 +85,19 @@ class Drive:
         self.robot = controller.policy.robot
         self.boxes = tuple(boxes)
         self.mode = Mode.STEER
-        self.steering = Steering()
+        self.wishes = Wishes()
         self.note = ""
         self.script: Script | None = None
         self.loop = False
         self._line = 0  # of the script, the next one
         self._built_boxes: tuple[Box, ...] | None = None  # that the model has
-        self._placed: Foothold | None = None
-        self._walking = self._trunk_asked = False
+        self._answered: tuple[_Question, tuple[Planned, Wishes]] | None = None
         self._build()
+
+    @property
+    def steering(self) -> Steering:
+        """What is asked for."""
+        return self.wishes.steering
 
     @property
     def timestep(self) -> float:
@@ -131,38 +140,36 @@ class Drive:
             self.note = planned.note
         swing = np.flatnonzero(planned.step.swing)
         if swing.size:
-            self.next_foot = 1 - int(swing[0])
+            self.wishes = self.wishes._replace(foot=1 - int(swing[0]))
 
     def _next(self) -> Planned:
         """What follows the task step that is over."""
-        start = self.step.end
         if self.mode is Mode.SCRIPT and self.script is not None:
             if self._line < len(self.script.steps):
                 self._line += 1
                 return Planned(self.script.steps[self._line - 1])
             if self.loop:
                 self.run(self.script, loop=True)
-                return Planned(self.step)
+                return Planned(self.taken.pop())
             self._steer_on(f"{self.script.name}: the script is over")
-        if self._placed is not None:
-            wanted, self._placed = self._placed, None
-            self._walking = False
-            return steering.place(self.robot, self.boxes, start, wanted, self.steering)
-        if self.steering.moves:
-            foot = self.next_foot if self._walking else steering.first_foot(self.steering, self.next_foot)
-            self._walking = True
-            return steering.walk(self.robot, self.boxes, start, foot, self.steering)
-        if self._walking:
-            self._walking = False
-            return steering.walk(self.robot, self.boxes, start, self.next_foot, self.steering)
-        if self._trunk_asked:
-            self._trunk_asked = False
-            within, note = steering.lean(self.robot, self.boxes, start, self.steering)
-            moved = steering.trunk_step(self.robot, start, within)
-            if not steering.same_trunk(start, moved.end):
-                self.steering = within
-                return Planned(moved, note)
-        return Planned(steering.hold(self.robot, start))
+        planned, self.wishes = self._following()
+        return planned
+
+    def plan_ahead(self) -> None:
+        """Plans what follows the task step under way, so that `advance` need not; another thread may call it.
+
+        Planning takes longer than a control step. What is asked for later makes it void.
+        """
+        if self.mode is Mode.STEER:
+            self._following()
+
+    def _following(self) -> tuple[Planned, Wishes]:
+        """The answer to what follows now, the one that was found ahead if there is any."""
+        question = self.boxes, self.step.end, self.wishes
+        answered = self._answered
+        if answered is None or not _same(answered[0], question):
+            self._answered = answered = question, steering.following(self.robot, *question)
+        return answered[1]
 
     # What one may ask for
 
@@ -172,22 +179,25 @@ class Drive:
         if self.mode is Mode.SCRIPT:
             self._steer_on("steering by hand")
         asked = steering.clamped(self.steering._replace(**wishes))
-        self._trunk_asked |= any(name.startswith("trunk") for name in wishes)
-        self._placed = None if asked.moves else self._placed
-        self.steering, self.note = asked, ""
+        self.wishes = self.wishes._replace(
+            steering=asked,
+            trunk=self.wishes.trunk or any(name.startswith("trunk") for name in wishes),
+            placed=None if asked.moves else self.wishes.placed,
+        )
+        self.note = ""
 
     def stop(self) -> None:
         """Feet come together at the next task step; then every target holds."""
         self._require_standing()
-        walking = self._walking or self.mode is Mode.SCRIPT
-        self.steer(ahead=0.0, aside=0.0, turn=0.0)
-        self._walking = walking
+        walking = self.wishes.walking or self.mode is Mode.SCRIPT
+        self.steer(**_STILL)
+        self.wishes = self.wishes._replace(walking=walking)
 
     def lead(self) -> None:
         """Holds as soon as the foot under way is down, and waits for `place`."""
         self._require_standing()
-        self.steer(ahead=0.0, aside=0.0, turn=0.0)
-        self._walking = False
+        self.steer(**_STILL)
+        self.wishes = self.wishes._replace(walking=False)
 
     def place(self, wanted: Foothold) -> str:
         """One step to a foothold, or to the nearest one within reach; returns the sentence that says so, or nothing."""
@@ -196,15 +206,9 @@ class Drive:
             raise ValueError(f"foothold {wanted[1:]}: wanted finite numbers")
         planned = steering.place(self.robot, self.boxes, self.step.end, wanted, self.steering)
         if planned.step.swing.any():
-            end = planned.step.end
-            x, y, _ = end.ankle_positions[wanted.foot]
-            self._placed = Foothold(wanted.foot, float(x), float(y), float(end.ankle_yaws[wanted.foot]))
+            self.wishes = self.wishes._replace(placed=steering.end_of(planned.step, wanted.foot))
         self.note = planned.note
         return planned.note
-
-    def reaches(self, wanted: Foothold) -> list[str]:
-        """What keeps the robot from a foothold once the task step under way is over; nothing if it can go there."""
-        return steering.problems(self.robot, self.boxes, self.step.end, wanted, self.steering)
 
     def push(self, impulse: float, direction_deg: float = 0.0) -> None:
         """Pushes the trunk with an impulse, N s, for 0.1 s; 0 deg is forward, 90 deg to the left."""
@@ -234,7 +238,7 @@ class Drive:
         """Starts a script where every script starts, among its own boxes; with loop again and again."""
         self.script, self.loop, self.boxes = script, loop, script.boxes
         self._build()
-        self.mode, self._line = Mode.SCRIPT, 0
+        self.mode = Mode.SCRIPT
         self.note = f"{script.name}: {len(script.steps)} task steps, {footsteps.duration(script):.1f} s"
         self.taken.clear()
         self._begin(self._next())
@@ -242,7 +246,6 @@ class Drive:
     def reset(self, boxes: Sequence[Box] | None = None) -> None:
         """Back to the start, holding; among other boxes if they are given."""
         self.boxes = self.boxes if boxes is None else tuple(boxes)
-        self.steering = self.steering._replace(ahead=0.0, aside=0.0, turn=0.0)
         self._steer_on("")
         self._build()
 
@@ -252,7 +255,6 @@ class Drive:
             return
         start = self.step.start
         self.taken.pop()
-        self.steering = self.steering._replace(ahead=0.0, aside=0.0, turn=0.0)
         self._steer_on("standing again at the last foothold")
         self._stand(start)
 
@@ -264,7 +266,6 @@ class Drive:
         """What there is to see now."""
         end = self.step.end
         measured = kinematics.measure(self.robot, self.data.qpos.copy())
-        trunk = steering.trunk_step(self.robot, end, self.steering).end
         return View(
             time=float(self.data.time),
             qpos=self.data.qpos.copy(),
@@ -277,8 +278,8 @@ class Drive:
             steering=self.steering,
             boxes=self.boxes,
             prints=self._prints(),
-            next_foot=self._placed or steering.beside(end, self.next_foot),
-            next_trunk=(trunk.trunk_position, trunk.trunk_orientation),
+            next_foot=self.wishes.placed or steering.beside(end, self.wishes.foot),
+            step=self.step,
         )
 
     # How it is done
@@ -290,7 +291,7 @@ class Drive:
             self._built_boxes = self.boxes
         self.data.time = 0.0
         self.taken: list[TaskStep] = []
-        self.next_foot = 0
+        self.wishes = self.wishes._replace(foot=0)
         self._stand(footsteps.initial_nodes(self.robot))
 
     def _stand(self, start: Nodes) -> None:
@@ -308,7 +309,8 @@ class Drive:
         mujoco.mj_forward(self.model, self.data)
         self.controller.reset(self.data.qpos)
         self._push, self._push_ticks = np.zeros(3), 0
-        self._placed, self._walking, self._trunk_asked, self._line = None, False, False, 0
+        self.wishes = Wishes(self.steering._replace(**_STILL), self.wishes.foot)
+        self._line = 0
         self.step = steering.hold(self.robot, start)._replace(end=start)
         self._begin(Planned(self.step))
         self.target = start
@@ -320,7 +322,8 @@ class Drive:
 
     def _steer_on(self, note: str) -> None:
         """Out of a script or a fall, into steering that holds."""
-        self.mode, self.script, self.note, self._walking = Mode.STEER, None, note, False
+        self.mode, self.script, self.note = Mode.STEER, None, note
+        self.wishes = self.wishes._replace(walking=False)
 
     def _require_standing(self) -> None:
         if self.mode is Mode.FALLEN:
@@ -333,6 +336,10 @@ class Drive:
         for step in (self.step, *ahead):
             for foot in range(len(LEGS)):
                 if step.swing[foot]:
-                    x, y, _ = step.end.ankle_positions[foot]
-                    found.append(Foothold(foot, float(x), float(y), float(step.end.ankle_yaws[foot])))
+                    found.append(steering.end_of(step, foot))
         return tuple(found)
+
+
+def _same(asked: _Question, now: _Question) -> bool:
+    """Nodes are compared by identity: every task step ends with its own."""
+    return asked[1] is now[1] and asked[::2] == now[::2]

@@ -41,6 +41,8 @@ _KEYS = """
 **Keys** (click into the picture first): **I** forward, **K** backward, **J** turn left, **L** turn right, **U** sidle left,
 **O** sidle right, **space** stop and hold, **B** push, **P** pause, **N** single step, **G** stand up, **R** reset.
 W A S D, the arrows and the mouse move the camera.
+
+**Drag** the arrows and the square at a foot to place it, those at the trunk to move it: red is out of reach.
 """
 
 
@@ -116,8 +118,10 @@ class Page:
     def _steer(self, **wishes: float) -> None:
         self._ask(lambda drive: drive.steer(**wishes))
 
-    def _button(self, label: str, request: Callable[[], Any], hint: str | None = None) -> None:
-        self._server.gui.add_button(label, hint=hint).on_click(lambda _: request())
+    def _button(self, label: str, request: Callable[[], Any], hint: str | None = None) -> viser.GuiButtonHandle:
+        button = self._server.gui.add_button(label, hint=hint)
+        button.on_click(lambda _: request())
+        return button
 
     # Panels
 
@@ -145,7 +149,7 @@ class Page:
             group = gui.add_button_group("", names)
             group.on_click(lambda event: moves[str(event.target.value)][1]())
         self._button("stop and hold", moves["stop and hold"][1])
-        self._button("stand up at the last foothold", lambda: self._ask(Drive.stand_up), "after a fall")
+        self._stand_up = self._button("stand up at the last foothold", lambda: self._ask(Drive.stand_up), "after a fall")
         self._button("reset", lambda: self._ask(Drive.reset), "back to the start")
         ground = gui.add_dropdown("ground", ("level", "stairs", "obstacles"))
         ground.on_update(lambda event: self._lay_out(str(event.target.value)))
@@ -175,7 +179,7 @@ class Page:
         self._loop = gui.add_checkbox("loop", False)
         self._button("run", self._run_script)
         self._button("stop and hold ", lambda: self._ask(Drive.stop))
-        gui.add_button("save").on_click(lambda event: self._save(event, self._text.value, "script.csv"))
+        gui.add_button("save").on_click(self._save)
         gui.add_button("the drive so far as a script").on_click(lambda _: self._write_down())
         upload = gui.add_upload_button("load a file", mime_type=".csv,text/csv,text/plain")
         self._problems = gui.add_markdown("")
@@ -203,9 +207,10 @@ class Page:
         if written is not None:
             self._text.value = written
 
-    def _save(self, event: Any, text: str, name: str) -> None:
+    def _save(self, event: Any) -> None:
+        """The editor's text as a file, to the one who asked."""
         if event.client is not None:
-            event.client.send_file_download(name, text.encode(), save_immediately=True)
+            event.client.send_file_download("script.csv", self._text.value.encode(), save_immediately=True)
 
     def _add_watching(self) -> None:
         """Plots, push, time, policy."""
@@ -225,7 +230,7 @@ class Page:
         with gui.add_folder("policy"):
             chosen = gui.add_dropdown("policy", tuple(self._policies))
             chosen.on_update(lambda event: self._use(str(event.target.value)))
-            feedback = gui.add_checkbox("feedback (off: inverse kinematics alone)", True)
+            feedback = gui.add_checkbox("feedback", True, hint="off: inverse kinematics alone")
             feedback.on_update(lambda event: self._ask(lambda drive: setattr(drive, "feedback", bool(event.target.value))))
 
     def _add_plot(self, title: str, labels: tuple[str, ...], names: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
@@ -289,38 +294,35 @@ class Page:
         elif handle in self.scene.held:
             self.scene.mark(handle, reaches())
 
-    def _wanted_foothold(self) -> steering.Foothold:
-        return self.scene.foothold(self.clock.view.next_foot.foot)
+    # What is within reach is searched in the viewer's own thread, for it takes long: the drive goes on meanwhile.
+
+    def _wanted_foothold(self, view: View) -> steering.Foothold:
+        return self.scene.foothold(view.next_foot.foot)
 
     def _reaches_foot(self) -> bool:
-        wanted = self._wanted_foothold()
-        return not self._ask(lambda drive: drive.reaches(wanted))
+        view = self.clock.view
+        return not steering.problems(self._robot, view.boxes, view.step.end, self._wanted_foothold(view), view.steering)
 
     def _place_foot(self) -> None:
-        wanted = self._wanted_foothold()
-        boxes, end, asked = self._ask(lambda drive: (drive.boxes, drive.step.end, drive.steering))
-        # the search for the nearest foothold takes long; the robot does not wait for it
-        planned = steering.place(self._robot, boxes, end, wanted, asked)
-        if planned.step.swing.any():
-            end = planned.step.end
-            x, y, _ = end.ankle_positions[wanted.foot]
-            found = steering.Foothold(wanted.foot, float(x), float(y), float(end.ankle_yaws[wanted.foot]))
-            self._ask(lambda drive: drive.place(found))
+        view = self.clock.view
+        wanted = self._wanted_foothold(view)
+        planned = steering.place(self._robot, view.boxes, view.step.end, wanted, view.steering)
+        possible = planned.step.swing.any()
+        if possible:
+            self._ask(lambda drive: drive.place(steering.end_of(planned.step, wanted.foot)))
         if planned.note:
-            self._say(planned.note, wrong=not planned.step.swing.any())
+            self._say(planned.note, wrong=not possible)
 
-    def _wanted_trunk(self) -> Steering:
-        end, now = self._ask(lambda drive: (drive.step.end, drive.steering))
-        return steering.trunk_at(self._robot, end, self.scene.trunk.position, self.scene.trunk.wxyz, now)
+    def _wanted_trunk(self, view: View) -> Steering:
+        return steering.trunk_at(self._robot, view.step.end, self.scene.trunk.position, self.scene.trunk.wxyz, view.steering)
 
     def _reaches_trunk(self) -> bool:
-        wanted = self._wanted_trunk()
+        wanted = self._wanted_trunk(self.clock.view)
         return steering.clamped(wanted) == wanted
 
     def _place_trunk(self) -> None:
-        wanted = self._wanted_trunk()
-        boxes, end = self._ask(lambda drive: (drive.boxes, drive.step.end))
-        within, note = steering.lean(self._robot, boxes, end, wanted)
+        view = self.clock.view
+        within, note = steering.lean(self._robot, view.boxes, view.step.end, self._wanted_trunk(view))
         self._steer(**{name: value for name, value in within._asdict().items() if name.startswith("trunk")})
         if note:
             self._say(note)
@@ -334,7 +336,12 @@ class Page:
             f"**{view.mode.value}** at {view.time:.1f} s, {factor}; "
             f"a control step takes {pace.step_ms:.1f} ms, 99 %: {pace.step_p99_ms:.1f} ms"
         )
-        note = f"**{view.note}**" if view.mode is Mode.FALLEN else view.note
+        fallen = view.mode is Mode.FALLEN
+        if self._stand_up.disabled is fallen:
+            self._stand_up.disabled = not fallen
+        # never without words, or all that stands below would move away from under the mouse
+        note = view.note or ("walking" if view.steering.moves or view.prints else "holding")
+        note = f"**{note}**" if fallen else note
         if self._note.content != note:
             self._note.content = note
         for name, slider in self._sliders.items():
@@ -345,9 +352,8 @@ class Page:
     def _show_plots(self) -> None:
         history: list[Sample] = list(self.clock.history)[::2]
         times = np.array([sample.time for sample in history])
-        if len(times) < 2 or (np.diff(times) < 0).any():  # after a reset, only what came after it
-            first = int(np.flatnonzero(np.diff(times) < 0)[-1]) + 1 if len(times) > 1 else 0
-            history, times = history[first:], times[first:]
+        for reset in np.flatnonzero(np.diff(times) < 0)[-1:] + 1:  # only what came after it
+            history, times = history[reset:], times[reset:]
         for plot, names in self._plots:
             if len(times):
                 plot.data = (times, *(np.array([getattr(sample, name) for sample in history]) for name in names))

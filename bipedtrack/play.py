@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import importlib.util
 import os
 import pathlib
@@ -45,7 +46,7 @@ class Play:
 
 
 def shipped() -> dict[str, pathlib.Path]:
-    """The policies that come with the package, by name, `first` first."""
+    """The policies that come with the package, by name, `best` first."""
     found = {path.stem: path for path in sorted((paths.data_dir("models") / "policies").glob("*.npz"))}
     return {name: found[name] for name in sorted(found, key=lambda name: (name != "best", name))}
 
@@ -94,6 +95,8 @@ def serve(options: Play) -> Iterator[Page]:
         page = Page(server, clock, policies)
         drawing = threading.Thread(target=page.run, name="drawing", daemon=True)
         drawing.start()
+        gc.collect()
+        gc.freeze()  # to go through all that has been imported stops every thread for 50 ms, again and again
         try:
             yield page
         finally:

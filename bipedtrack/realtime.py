@@ -1,4 +1,7 @@
-"""A drive at real time in a thread of its own: 200 control steps a second, whoever watches or asks for something."""
+"""A drive at real time in a thread of its own: 200 control steps a second, whoever watches or asks for something.
+
+A second thread plans the next task step while the present one is under way.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,8 @@ from bipedtrack.drive import Drive, View
 VIEW_SECONDS = 1 / 30  # between two views
 HISTORY_SECONDS = 10.0
 _LATE = 0.25  # s behind the clock from which the lost time is given up
-_SWITCH = 0.001  # s after which Python lets another thread run, so that a busy page delays no control step for long
+_SWITCH = 0.0002  # s after which Python lets another thread run, so that page and planning delay no control step for long
+_PLAN_SECONDS = 0.01  # between two looks whether there is something to plan
 
 Answer = TypeVar("Answer")
 
@@ -54,7 +58,8 @@ class RealTime:
             queue.SimpleQueue()
         )
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+        loops = {"control": self._run, "planning": self._plan}
+        self._threads = [threading.Thread(target=loop, name=name, daemon=True) for name, loop in loops.items()]
         steps = round(HISTORY_SECONDS / drive.timestep)
         self._durations: deque[float] = deque(maxlen=steps)
         self._works: deque[float] = deque(maxlen=steps)
@@ -68,12 +73,14 @@ class RealTime:
     def start(self) -> None:
         """Lets the time run."""
         sys.setswitchinterval(_SWITCH)
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def stop(self) -> None:
-        """Ends the thread."""
+        """Ends the threads."""
         self._stopped.set()
-        self._thread.join(timeout=5)
+        for thread in self._threads:
+            thread.join(timeout=5)
 
     def ask(self, request: Callable[[Drive], Answer], timeout: float = 10.0) -> Answer:
         """What the request returns; it has the drive for itself between two control steps. Raises what it raises."""
@@ -118,6 +125,11 @@ class RealTime:
             if asked or now >= next_view:
                 next_view = max(next_view + VIEW_SECONDS, now)
                 self._look(now)
+
+    def _plan(self) -> None:
+        """Keeps the next task step ready: planning it takes longer than a control step may."""
+        while not self._stopped.wait(_PLAN_SECONDS):
+            self._drive.plan_ahead()
 
     def _answer_requests(self) -> bool:
         """Whether there was any."""

@@ -11,10 +11,11 @@ import numpy as np
 import trimesh
 import viser
 
-from bipedtrack import footsteps, robot, rotations
+from bipedtrack import footsteps, robot, rotations, steering
 from bipedtrack.drive import View
 from bipedtrack.footsteps import Box
-from bipedtrack.steering import Foothold
+from bipedtrack.nodes import Nodes
+from bipedtrack.steering import Foothold, Steering
 
 TARGET_COLOR = (0, 204, 0)
 MEASURED_COLOR = (255, 217, 0)
@@ -72,6 +73,7 @@ class Scene:
         self._trunk_box = self._scene.add_box(
             "/world/next_trunk/box", dimensions=(0.3, 0.3, 0.15), color=TARGET_COLOR, opacity=0.25, cast_shadow=False
         )
+        self._trunk_asked: tuple[Nodes, Steering] | None = None  # to which `_trunk_end` belongs
         self.held: set[str] = set()  # handles in somebody's hand, "foot" or "trunk": they stay where they are held
 
     @property
@@ -118,8 +120,16 @@ class Scene:
             self._hold_at(self.foot, *self._on_ground(view.next_foot))
             self._foot_plate.color = PRINT_COLORS[view.next_foot.foot]
         if "trunk" not in self.held:
-            self._hold_at(self.trunk, *view.next_trunk)
+            self._hold_at(self.trunk, *self._next_trunk(view))
             self._trunk_box.color = TARGET_COLOR
+
+    def _next_trunk(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Position and quaternion of the trunk as it is asked to be over the feet."""
+        asked = view.step.end, view.steering
+        if self._trunk_asked is None or self._trunk_asked[0] is not asked[0] or self._trunk_asked[1] != asked[1]:
+            self._trunk_asked = asked
+            self._trunk_end = steering.trunk_step(self._robot, *asked).end
+        return self._trunk_end.trunk_position, self._trunk_end.trunk_orientation
 
     def show_traces(self) -> None:
         """Draws the traces up to the last view; it costs more than the rest, so do it less often."""
@@ -169,7 +179,7 @@ class Scene:
                 node.position, node.wxyz = self._on_ground(prints[i])
 
 
-def _places(nodes: Any) -> np.ndarray:
+def _places(nodes: Nodes) -> np.ndarray:
     """Trunk, left and right ankle, (3, 3) m."""
     return np.concatenate([np.nan_to_num(nodes.trunk_position)[None], np.nan_to_num(nodes.ankle_positions)])
 

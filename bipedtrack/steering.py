@@ -88,6 +88,16 @@ class Planned(NamedTuple):
     note: str = ""
 
 
+class Wishes(NamedTuple):
+    """All that the next task step depends on, besides the ground and where the last one ended."""
+
+    steering: Steering = Steering()
+    foot: int = 0  # whose turn it is, 0 left, 1 right
+    walking: bool = False  # feet have stepped on, and have yet to come together
+    trunk: bool = False  # the trunk has been asked to go elsewhere
+    placed: Foothold | None = None  # the next foothold, by hand
+
+
 def clamped(asked: Steering) -> Steering:
     """The same wishes within LIMITS; what is not finite becomes the default."""
     values = {}
@@ -96,6 +106,25 @@ def clamped(asked: Steering) -> Steering:
         default = Steering._field_defaults[name]
         values[name] = min(max(float(value), low), high) if math.isfinite(value) else default
     return Steering(**values)
+
+
+def following(robot: Robot, boxes: Sequence[Box], start: Nodes, wishes: Wishes) -> tuple[Planned, Wishes]:
+    """The task step after one that ended at `start`, and what is still wished for after it."""
+    asked = wishes.steering
+    if wishes.placed is not None:
+        return place(robot, boxes, start, wishes.placed, asked), wishes._replace(placed=None, walking=False)
+    if asked.moves:
+        foot = wishes.foot if wishes.walking else first_foot(asked, wishes.foot)
+        return walk(robot, boxes, start, foot, asked), wishes._replace(walking=True)
+    if wishes.walking:
+        return walk(robot, boxes, start, wishes.foot, asked), wishes._replace(walking=False)
+    if wishes.trunk:
+        within, note = lean(robot, boxes, start, asked)
+        moved = trunk_step(robot, start, within)
+        wishes = wishes._replace(trunk=False)
+        if not same_trunk(start, moved.end):
+            return Planned(moved, note), wishes._replace(steering=within)
+    return Planned(hold(robot, start)), wishes
 
 
 def first_foot(asked: Steering, otherwise: int) -> int:
@@ -107,6 +136,12 @@ def first_foot(asked: Steering, otherwise: int) -> int:
 def beside(start: Nodes, foot: int) -> Foothold:
     """Where the foot stands side by side with the other one."""
     return _moved_on(start, foot, np.zeros(3))
+
+
+def end_of(step: TaskStep, foot: int) -> Foothold:
+    """The foothold at which a foot ends."""
+    x, y, _ = step.end.ankle_positions[foot]
+    return Foothold(foot, float(x), float(y), float(step.end.ankle_yaws[foot]))
 
 
 def walk(robot: Robot, boxes: Sequence[Box], start: Nodes, foot: int, asked: Steering) -> Planned:

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,11 @@ class Tab:
         """The value of a JavaScript expression."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
+    def draw(self) -> None:
+        """Waits until all that the page knows by now has been drawn."""
+        twice = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+        self.call("Runtime.evaluate", expression=twice, awaitPromise=True)
+
     @property
     def text(self) -> str:
         """What can be read on the page."""
@@ -82,11 +87,13 @@ class Tab:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
 
     def click(self, text: str) -> None:
-        """Clicks with the mouse on the button, tab or checkbox with exactly this text, once it is there."""
+        """Clicks with the mouse on the button, tab, checkbox, choice or field with exactly this text, once it is there."""
         script = (
-            "(() => { for (const e of document.querySelectorAll('button, [role=tab], label')) {"
-            f" if (e.innerText.trim() !== {json.dumps(text)} || !e.getClientRects().length) continue;"
-            " e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
+            "(() => { for (const e of document.querySelectorAll('button, [role=tab], [role=option], label, input')) {"
+            f" if ((e.innerText.trim() || e.value) !== {json.dumps(text)} || !e.getClientRects().length) continue;"
+            " const box = e.closest('div').parentElement.querySelector('input[type=checkbox]');"
+            " const target = e.tagName === 'LABEL' && box ? box : e;"
+            " target.scrollIntoView({block: 'center'}); const b = target.getBoundingClientRect();"
             " return [b.x + b.width / 2, b.y + b.height / 2]; } return null; })()"
         )
 
@@ -96,9 +103,43 @@ class Tab:
             time.sleep(0.2)
             return before if before == self.evaluate(script) else None
 
-        x, y = wait_until(at_rest)
+        self.click_at(wait_until(at_rest))
+
+    def click_at(self, pixel: tuple[float, float]) -> None:
+        """Clicks there."""
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            self._mouse(kind, pixel)
+
+    def write(self, text: str) -> None:
+        """Replaces what stands in the field that has been clicked on."""
+        self.evaluate("document.activeElement.select()")
+        self.call("Input.insertText", text=text)
+
+    def give(self, file: Path) -> None:
+        """Chooses a file for the page's only button that takes one."""
+        root = self.call("DOM.getDocument")["root"]["nodeId"]
+        node = wait_until(lambda: self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"])
+        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(file)])
+
+    def drag(self, way: Sequence[tuple[float, float]], release: bool = True) -> None:
+        """Presses the mouse at the first pixel of a way and moves it along the others; without release it stays down."""
+        self._mouse("mouseMoved", way[0], "none")
+        self.draw()  # what lies under the mouse lights up
+        self._mouse("mousePressed", way[0])
+        for pixel in way[1:]:
+            self.draw()
+            self._mouse("mouseMoved", pixel)
+        if release:
+            self.release(way[-1])
+
+    def release(self, pixel: tuple[float, float]) -> None:
+        """Lets go of the mouse."""
+        self._mouse("mouseReleased", pixel)
+
+    def _mouse(self, kind: str, pixel: tuple[float, float], button: str = "left") -> None:
+        x, y = pixel
+        down = int(button == "left" and kind != "mouseReleased")
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=down, clickCount=1)
 
     def picture(self) -> bytes:
         """A PNG of what is seen."""

@@ -265,7 +265,7 @@ def test_it_steps_where_a_foothold_is_placed(drive: Drive) -> None:
     assert drive.place(Foothold(0, 0.15, 0.14, 0.1)) == ""
     go(drive, 2.5)
     assert np.allclose(drive.view().measured.ankle_positions[0, :2], [0.15, 0.14], atol=0.03)
-    assert drive.next_foot == 1
+    assert drive.wishes.foot == 1
     assert "moved" in drive.place(Foothold(1, 0.15, -3.0, 0.0))
     go(drive, 2.5)
     assert drive.mode is Mode.STEER
@@ -375,3 +375,30 @@ def test_a_view_does_not_change_later(drive: Drive) -> None:
     go(drive, 1.0)
     assert np.array_equal(view.qpos, before)
     assert view.time == 0.0
+
+
+def test_what_was_planned_ahead_is_taken_and_a_later_wish_voids_it(shipped: policy.Policy) -> None:
+    """Task steps are those of a drive that plans when a step is over."""
+    ahead, otherwise = (Drive(policy.Controller(shipped)) for _ in range(2))
+    for drive in (ahead, otherwise):
+        drive.steer(ahead=1.0)
+        go(drive, 0.3)
+    ahead.plan_ahead()
+    found = ahead._answered
+    assert found is not None
+    go(ahead, 0.55)
+    assert ahead.step is found[1][0].step
+    go(otherwise, 0.55)
+    for drive in (ahead, otherwise):
+        drive.plan_ahead() if drive is ahead else None
+        drive.steer(ahead=0.0, turn=1.0)
+        go(drive, 2.0)
+    for mine, theirs in zip(ahead.taken, otherwise.taken, strict=True):
+        assert max(np.abs(part).max() for part in nodes.difference(mine.end, theirs.end)) == 0.0
+
+
+def test_a_loop_is_written_down_once(drive: Drive) -> None:
+    script = footsteps.load(scripts.ready()["walk"], drive.robot)
+    drive.run(script, loop=True)
+    go(drive, footsteps.duration(script) + 0.1)
+    assert len(drive.taken) == 1
