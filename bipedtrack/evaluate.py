@@ -38,8 +38,8 @@ class Evaluate:
     """Of each task."""
     seconds: float = 10.0
     """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
-    engine: Literal["mjx", "mujoco", "both"] = "both"
-    """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one."""
+    engine: Literal["mjx", "mujoco", "converged", "both"] = "both"
+    """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one; converged is that alone."""
     seed: int = SEED
     """Decides the episodes, together with the task's name."""
     out: pathlib.Path = pathlib.Path("evaluation")
@@ -100,12 +100,12 @@ class Engines:
     """The recorders of one subject, each compiled once."""
 
     def __init__(self, who: Subject, engine: str):
-        """engine: mjx, mujoco or both."""
+        """engine: as Evaluate.engine."""
         with quiet_imports():
             from bipedtrack import recording
 
         self._who = who
-        self.names = [n for n in ENGINES if engine == "both" or (n == "mjx") == (engine == "mjx")]
+        self.names = {"both": ENGINES, "mujoco": ("mujoco", "converged")}.get(engine, (engine,))
         controls = recording.Controls(who.robot, who.settings, who.policy_period, who.act, who.feedforward)
         self._mujoco = recording.mujoco_recorder(controls)
         self._mjx: dict[Any, Any] = {}
@@ -173,7 +173,7 @@ def run(options: Evaluate) -> dict[str, Any]:
                 results[engine] = {"summary": _rounded(summary), "course": {k: _thin(v) for k, v in course.items()}}
                 results[engine]["path"] = _path(recorded.episode(0))
                 results[engine]["levels"] = [_level(level, recorded) for level in batch.levels]
-                if engine != "converged":
+                if engine != "converged" or len(engines.names) == 1:
                     for episode in range(min(_TRACES, len(recorded.alive))):
                         file = options.out / "traces" / f"{stem}-{engine}-{name}-{episode}.npz"
                         trace.save(recorded.episode(episode), file)

@@ -220,6 +220,20 @@ def record(short: pathlib.Path) -> Callable[..., trace.Trace]:
     return recorded
 
 
+@pytest.mark.parametrize(
+    ("engine", "names"),
+    [
+        ("both", ["mjx", "mujoco", "converged"]),
+        ("mujoco", ["mujoco", "converged"]),
+        ("mjx", ["mjx"]),
+        ("converged", ["converged"]),
+    ],
+)
+def test_an_engine_is_run_alone_or_beside_others(engine: str, names: list[str]) -> None:
+    options = tyro.cli(evaluate.Evaluate, args=["ik", "--engine", engine])
+    assert list(evaluate.Engines(evaluate.subject("ik", options), options.engine).names) == names
+
+
 def follow(robot: robots.Robot, found: trace.Trace) -> np.ndarray:
     """The joint angles (n, 12) of the targets by inverse kinematics; the trunk is level here."""
     targets = [Nodes(*(part[0, t].astype(float) for part in found.target)) for t in range(len(found.time))]
