@@ -159,7 +159,9 @@ class Chromium:
     def __enter__(self) -> "Chromium":
         command = [str(PROGRAM), *FLAGS, f"--user-data-dir={self._profile}", "about:blank"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._process = subprocess.Popen(command, env={**os.environ, "HOME": str(self._profile)}, **quiet)  # type: ignore[call-overload]
+        # in a session of its own, as where a person starts it: schedulers share the processor out among sessions
+        environment = {**os.environ, "HOME": str(self._profile)}
+        self._process = subprocess.Popen(command, env=environment, start_new_session=True, **quiet)  # type: ignore[call-overload]
         port_file = self._profile / "DevToolsActivePort"
         wait_until(lambda: port_file.is_file() and len(port_file.read_text().splitlines()) == 2, 60)
         self._port = port_file.read_text().splitlines()[0]
