@@ -250,19 +250,14 @@ def _train(directory: checkpoint.RunDirectory, job: Job, description: str, proce
     calls = curriculum.calls(plan)
     found = directory.latest()
     finished = 0 if found is None else found.call + 1
+    done = f"{finished} calls are done" if finished else "begins with another run's network"
     with Progress(directory.path, plan, calls, sum(call.steps for call in calls[:finished])) as progress:
         for warning in directory.warnings:
             progress.say(f"warning: {warning}")
         progress.say(
             f"{plan.name}, seed {seed}, on {description}: {len(plan.stages)} stages, {len(calls)} PPO calls, "
             f"{sum(call.steps for call in calls) / 1e6:.1f} M policy steps, in {directory.path}"
-            + (
-                ""
-                if found is None
-                else f"; {finished} calls are done"
-                if finished
-                else "; begins with another run's network"
-            )
+            + ("" if found is None else f"; {done}")
         )
         try:
             training.train(plan, directory, seed, job.devices, progress, stop, process)
