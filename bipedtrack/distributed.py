@@ -70,6 +70,8 @@ def join(coordinator: str, processes: int, process: int, detect: bool) -> Proces
         given |= {"coordinator_bind_address": coordinator, "cluster_detection_method": "deactivate"}
     import jax
 
+    # it watches for machines that a cluster is about to take back, and warns on stderr when the coordinator has left
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
             **given,
@@ -130,9 +132,11 @@ def from_first(name: str, give: Callable[[], Any], process: Process) -> Any:
         given = give() if process.first else None
     except Exception:
         hand_over("")
+        part(process)
         raise
     text = hand_over(json.dumps(given))
     if not text:
+        part(process)
         raise DistributedError(f"{process}: the first process refused")
     return json.loads(text)
 
