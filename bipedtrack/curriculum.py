@@ -15,7 +15,7 @@ from bipedtrack import checkpoint, config, footsteps, paths, scripts
 from bipedtrack.control import ControlConfig
 from bipedtrack.rewards import RewardConfig
 from bipedtrack.robot import Robot
-from bipedtrack.tasks import Ranges, Shares
+from bipedtrack.sampling import Ranges, Shares
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,7 +36,7 @@ _LARGEST = 1e3  # m, rad, m/s or rad/s: a state beyond has exploded; one such nu
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """What an environment is built from besides the robot; everything else is data (tasks.Distribution)."""
+    """What an environment is built from besides the robot; everything else is data (sampling.Distribution)."""
 
     rewards: rewards.RewardConfig
     control: control.ControlConfig
@@ -64,7 +64,7 @@ class Episode(NamedTuple):
     """What one robot's episode remembers beside its physics."""
 
     key: Array  # random key of what comes next
-    given: Any  # what the source draws from: tasks.Distribution or plans.Plan
+    given: Any  # what the source draws from: sampling.Distribution or plans.Plan
     task: Any  # what the source remembers of the episode
     step: planner.TaskStep
     index: Array  # () number of the task step

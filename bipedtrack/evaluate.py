@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, scripts, tasks, trace, versions
+from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, sampling, scripts, trace, versions
 from bipedtrack.disturbances import LADDERS, UNDISTURBED, Hooks
 from bipedtrack.messages import fail, quiet_imports
 from bipedtrack.swings import Boxes
@@ -205,8 +205,8 @@ def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.
         script = footsteps.load(path, the_robot)
         # a script is the same every time: more episodes would tell nothing
         return suite.script_batch(script, 1), footsteps.duration(script)
-    seconds = suite.duration(name, tasks.Ranges(), options.seconds)
-    return suite.batch(name, tasks.Ranges(), the_robot, options.episodes, seconds, options.seed), seconds
+    seconds = suite.duration(name, sampling.Ranges(), options.seconds)
+    return suite.batch(name, sampling.Ranges(), the_robot, options.episodes, seconds, options.seed), seconds
 
 
 def _level(level: suite.Level, recorded: trace.Trace) -> dict[str, Any]:
@@ -253,7 +253,7 @@ def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float
     from bipedtrack import suite
 
     episodes = min(options.episodes, 64)
-    batch = suite.batch("walk-forward", tasks.Ranges(), who.robot, episodes, options.seconds, options.seed)
+    batch = suite.batch("walk-forward", sampling.Ranges(), who.robot, episodes, options.seconds, options.seed)
     found: dict[str, Any] = {}
     for name, ladder in LADDERS.items():
         rows = []

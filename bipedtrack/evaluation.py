@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import rich.table
 
-from bipedtrack import curriculum, env, policy, robot, rollout, tasks
+from bipedtrack import curriculum, env, policy, robot, rollout, sampling
 
 HOLD = "hold"  # any kind, stopped after some task steps
 
@@ -41,7 +41,7 @@ def by_kind(
       episodes: for each row.
       seed: of the episodes; the same seed gives the same episodes to every policy.
     """
-    kinds = [k for k in tasks.KINDS if any(getattr(stage.shares, k) > 0 for stage in config.stages)]
+    kinds = [k for k in sampling.KINDS if any(getattr(stage.shares, k) > 0 for stage in config.stages)]
     holds = [stage for stage in config.stages if stage.hold_share > 0]
     given = [_only(config, {kind: 1.0}, difficulty, 0.0, (0, 0)) for kind in kinds]
     if holds:
@@ -71,9 +71,9 @@ def _only(
     difficulty: float,
     hold_share: float,
     hold_after: tuple[int, int],
-) -> tasks.Distribution:
-    chosen = tasks.Shares(**(dict.fromkeys(tasks.KINDS, 0.0) | shares))
-    return tasks.distribution(config.ranges, chosen, difficulty, hold_share, hold_after)
+) -> sampling.Distribution:
+    chosen = sampling.Shares(**(dict.fromkeys(sampling.KINDS, 0.0) | shares))
+    return sampling.distribution(config.ranges, chosen, difficulty, hold_share, hold_after)
 
 
 def level_ground(rows: list[Row]) -> Row:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import footsteps, robot, tasks, terrain
+from bipedtrack import footsteps, robot, sampling, tasks, terrain
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.rotations import Array
@@ -28,7 +28,7 @@ class Plan(NamedTuple):
     boxes: Array  # (s, number of boxes, 7) position m and quaternion of every box during each task step
 
 
-def random_plan(key: Array, given: tasks.Distribution, the_robot: robot.Robot, steps: int) -> Plan:
+def random_plan(key: Array, given: sampling.Distribution, the_robot: robot.Robot, steps: int) -> Plan:
     """An episode of `steps` task steps drawn at random, with the boxes of its stairs; for `jit` and `vmap`."""
     key, key_begin = jax.random.split(key)
     task, start = tasks.begin(key_begin, given, the_robot)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import tasks
+from bipedtrack import sampling
 from bipedtrack.env import TrackingEnv
 from bipedtrack.rotations import Array
 from bipedtrack.tasks import ERRORS
@@ -33,7 +33,7 @@ class _Tally(NamedTuple):
 
 
 def outcomes(
-    env: TrackingEnv, act: Callable[[Array], Array], given: tasks.Distribution, seconds: float, seed: int
+    env: TrackingEnv, act: Callable[[Array], Array], given: sampling.Distribution, seconds: float, seed: int
 ) -> Outcome:
     """Rolls out one episode for each robot.
 
@@ -48,7 +48,7 @@ def outcomes(
     length = round(seconds / env.config.policy_period)
     chunk = min(50, length)
 
-    def start(key: Array, one: tasks.Distribution) -> tuple[brax.envs.State, _Tally]:
+    def start(key: Array, one: sampling.Distribution) -> tuple[brax.envs.State, _Tally]:
         zero = jnp.float32(0)
         return env.begin(key, one), _Tally(jnp.float32(1), zero, dict.fromkeys(ERRORS, zero))
 

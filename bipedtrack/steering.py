@@ -69,7 +69,7 @@ LIMITS = {
     "trunk_pitch": (-0.15, 0.15),
     "trunk_yaw": (-0.3, 0.3),
 }
-"""Least and greatest value of each number of Steering: what policies are trained for (tasks.Ranges)."""
+"""Least and greatest value of each number of Steering: what policies are trained for (sampling.Ranges)."""
 
 
 class Foothold(NamedTuple):

@@ -1,6 +1,6 @@
 """The tasks of the evaluation: the same plans for every policy, from fixed seeds and Table II's full ranges.
 
-Random tasks draw from `tasks.Ranges` with the named range narrowed to one direction; stairs go through a fixed grid of
+Random tasks draw from `sampling.Ranges` with the named range narrowed to one direction; stairs go through a fixed grid of
 risers and treads; scripts are the footstep files in `curricula/footsteps/`.
 """
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import footsteps, plans, robot, scripts, tasks, terrain
+from bipedtrack import footsteps, plans, robot, sampling, scripts, terrain
 
 RISERS = (0.05, 0.08, 0.11, 0.14, 0.17)  # m
 TREADS = (0.25, 0.30, 0.35)  # m
@@ -82,7 +82,7 @@ LONG_HOLDS = tuple(f"hold-60s-{name}" for name in MOVING)
 TASKS = (*_RANDOM, *HOLDS, *LONG_HOLDS, *SCRIPTS)
 
 
-def batch(name: str, ranges: tasks.Ranges, the_robot: robot.Robot, episodes: int, seconds: float, seed: int) -> Batch:
+def batch(name: str, ranges: sampling.Ranges, the_robot: robot.Robot, episodes: int, seconds: float, seed: int) -> Batch:
     """The episodes of a task of TASKS.
 
     Args:
@@ -118,7 +118,7 @@ def _lay_out(name: str, steps: int) -> Callable[..., plans.Plan]:
     return jax.jit(jax.vmap(lambda key, given: plans.random_plan(key, given, the_robot, steps)))
 
 
-def duration(name: str, ranges: tasks.Ranges, seconds: float) -> float:
+def duration(name: str, ranges: sampling.Ranges, seconds: float) -> float:
     """How long an episode of a random task lasts, s: a hold lasts that long, or 60 s, after the steps before it."""
     if not name.startswith("hold-"):
         return seconds
@@ -162,14 +162,14 @@ def script_batch(script: footsteps.Script, episodes: int = 1) -> Batch:
     return Batch(repeated, tuple(box.size for box in script.boxes), f"footstep script {pathlib.Path(script.name).name}")
 
 
-def _distribution(ranges: tasks.Ranges, what: _Random, hold: bool, episode: int) -> tasks.Distribution:
+def _distribution(ranges: sampling.Ranges, what: _Random, hold: bool, episode: int) -> sampling.Distribution:
     """What episode number `episode` is drawn from: stairs go through the grid, all else is the same for every one."""
     narrowed = dict(what.narrowed)
     if what.kind == "stairs":
         riser, tread = RISERS[episode % len(RISERS)], TREADS[episode // len(RISERS) % len(TREADS)]
         narrowed |= {"stair_riser": (riser,) * 3, "stair_tread": (tread,) * 3}
-    shares = tasks.Shares(**{kind: float(kind == what.kind) for kind in tasks.KINDS})
-    return tasks.distribution(
+    shares = sampling.Shares(**{kind: float(kind == what.kind) for kind in sampling.KINDS})
+    return sampling.distribution(
         ranges._replace(**narrowed),
         shares,
         1.0,

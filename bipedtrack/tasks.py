@@ -2,7 +2,6 @@
 
 `wander` is ours: every foothold anywhere within reach, and another posture with every step.
 
-All that lessons change (ranges, shares, hold) is data in a `Distribution`, so one compiled program serves every lesson.
 Random numbers are jax's; the namespace is jax.numpy.
 """
 
@@ -20,96 +19,13 @@ from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array
+from bipedtrack.sampling import SIDLE, SQUAT, STAIRS, WALK, WANDER, Distribution, sample, within
 
-KINDS = ("stand", "squat", "walk", "sidle", "turn", "wander", "stairs")
-STAND, SQUAT, WALK, SIDLE, TURN, WANDER, STAIRS = range(len(KINDS))
 MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
 ERRORS = ("ankle_error_cm", "ankle_yaw_error_deg", "trunk_error_cm", "trunk_error_deg")  # of `tracking_errors`
 FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
 _BREAKS = (2.0, 7.0)  # task steps from one break to the next, and one more than the most
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
-
-
-class Ranges(NamedTuple):
-    """Table II as ranges: (lowest, mildest, highest) at full difficulty; at difficulty 0 all is mildest."""
-
-    period: tuple[float, float, float] = (0.4, 0.55, 0.7)  # s, of a task step with a swing foot
-    walk_step: tuple[float, float, float] = (
-        -0.15,
-        0.0,
-        0.25,
-    )  # m the trunk advances per task step; a foot travels twice that
-    sidle_step: tuple[float, float, float] = (-0.12, 0.0, 0.12)  # m to the left per task step
-    turn_yaw: tuple[float, float, float] = (-0.35, 0.0, 0.35)  # rad per task step
-    turn_radius: tuple[float, float, float] = (0.0, 0.2, 0.6)  # m
-    stair_riser: tuple[float, float, float] = (0.02, 0.02, 0.17)  # m
-    stair_tread: tuple[float, float, float] = (0.25, 0.30, 0.35)  # m
-    lift: tuple[float, float, float] = (0.04, 0.08, 0.15)  # m above the higher end of the swing
-    trunk_height: tuple[float, float, float] = (0.70, 0.75, 0.79)  # m above the mean of the soles, while stepping
-    stair_trunk_height: tuple[float, float, float] = (0.70, 0.73, 0.75)  # m
-    step_variation: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on period, lift and advance from step to step
-    curve_along: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # shift of the Bezier control points, share of the way
-    curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
-    trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
-    swing_ease: tuple[float, float, float] = (0.2, 0.25, 0.3)  # planner.TaskStep.ease; 0: the paper's uniform curves
-    posture_x: tuple[float, float, float] = (
-        -0.05,
-        0.0,
-        0.05,
-    )  # m, centre of mass ahead of the feet's middle (stand, squat; else 0)
-    posture_y: tuple[float, float, float] = (-0.04, 0.0, 0.04)  # m, to the left of it
-    posture_height: tuple[float, float, float] = (0.60, 0.75, 0.79)  # m
-    posture_roll: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
-    posture_pitch: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
-    posture_yaw: tuple[float, float, float] = (-0.3, 0.0, 0.3)  # rad
-    foot_x: tuple[float, float, float] = (-0.1, 0.0, 0.1)  # m, left foot ahead of the right (stand, squat)
-    foot_distance: tuple[float, float, float] = (0.17, 0.20, 0.30)  # m
-    foot_yaw: tuple[float, float, float] = (-0.2, 0.0, 0.2)  # rad
-    squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s
-    wander_x: tuple[float, float, float] = (-0.10, 0.0, 0.25)  # m, of a foothold from beside the other foot, ahead
-    wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.15)  # m, outwards
-    wander_yaw: tuple[float, float, float] = (-0.25, 0.0, 0.25)  # rad
-    push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
-
-    def validate(self) -> None:
-        """Raises ValueError where a range does not grow."""
-        for name, (low, mild, high) in self._asdict().items():
-            if not low <= mild <= high:
-                raise ValueError(f"{name} must be [lowest, mildest, highest], not {[low, mild, high]}")
-        if self.period[0] <= 0 or self.squat_period[0] <= 0:
-            raise ValueError("periods must be positive")
-        if not 0 <= self.swing_ease[0] <= self.swing_ease[2] < 0.5:
-            raise ValueError(f"swing_ease must lie in [0, 0.5), not {list(self.swing_ease)}")
-
-
-class Shares(NamedTuple):
-    """How often each kind is drawn, up to a common factor."""
-
-    stand: float
-    squat: float
-    walk: float
-    sidle: float
-    turn: float
-    stairs: float
-    wander: float = 0.0
-
-    def validate(self) -> None:
-        """Raises ValueError where no kind can be drawn."""
-        if min(self) < 0 or sum(self) <= 0:
-            raise ValueError(f"shares must not be negative and not all be zero: {self._asdict()}")
-
-
-class Distribution(NamedTuple):
-    """What episodes are drawn from: arrays, carried along in the state of every environment."""
-
-    shares: Array  # (7,) cumulative in the order of KINDS, ending at 1
-    hold_share: Array  # () share of the episodes that stop and hold
-    hold_after: Array  # (2,) least and greatest number of task steps before the hold
-    down_share: Array  # () share of the stairs that go down
-    mix_share: Array  # () share of the episodes on level ground that change their kind every MIX_STEPS task steps
-    break_share: Array  # () share of the episodes that stop in stride, or bring the feet together, every few task steps
-    push_share: Array  # () share of the episodes with pushes
-    ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
 
 
 class Motion(NamedTuple):
@@ -134,48 +50,6 @@ class Task(NamedTuple):
     break_every: Array  # () number of task steps of which the last one is a break
     pauses: Array  # () bool: in a break nothing moves; else the swing foot comes beside the other one
     push: Array  # () N s, the greatest impulse of a push
-
-
-def distribution(
-    ranges: Ranges,
-    shares: Shares,
-    difficulty: float,
-    hold_share: float,
-    hold_after: tuple[int, int],
-    down_share: float = 0.5,
-    mix_share: float = 0.0,
-    push_share: float = 0.0,
-    break_share: float = 0.0,
-) -> Distribution:
-    """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
-    ordered = [getattr(shares, kind) for kind in KINDS]
-    total = jnp.array(ordered, jnp.float32)
-    last = max(i for i, share in enumerate(ordered) if share > 0)  # rounding must not leave room behind it
-    scaled = {
-        name: jnp.array([mild + difficulty * (low - mild), mild + difficulty * (high - mild)], jnp.float32)
-        for name, (low, mild, high) in ranges._asdict().items()
-    }
-    return Distribution(
-        shares=jnp.cumsum(total / total.sum()).at[last:].set(1.0),
-        hold_share=jnp.float32(hold_share),
-        hold_after=jnp.array(hold_after, jnp.float32),
-        down_share=jnp.float32(down_share),
-        mix_share=jnp.float32(mix_share),
-        break_share=jnp.float32(break_share),
-        push_share=jnp.float32(push_share),
-        ranges=scaled,
-    )
-
-
-def _draw(key: Array, names: tuple[str, ...], ranges: dict[str, Array]) -> dict[str, Array]:
-    """One uniform number per name, within its range."""
-    u = jax.random.uniform(key, (len(names),))
-    return {name: _within(u[i], ranges[name]) for i, name in enumerate(names)}
-
-
-def _within(u: Array, bounds: Array) -> Array:
-    """The number at the share u of a range (2,)."""
-    return bounds[0] + u * (bounds[1] - bounds[0])
 
 
 class _Posture(NamedTuple):
@@ -219,7 +93,7 @@ def _motion(key: Array, given: Distribution, level: bool) -> tuple[Motion, dict[
     u: Array = jax.random.uniform(key_kind, (2,))
     reach = given.shares[STAIRS - 1] if level else 1.0
     kind = jnp.minimum(jnp.searchsorted(given.shares, reach * u[0], side="right"), STAIRS - 1 if level else STAIRS)
-    draw = _draw(
+    draw = sample(
         key_motion,
         ("period", "walk_step", "sidle_step", "turn_yaw", "turn_radius", "stair_riser", "stair_tread", "lift")
         + ("trunk_height", "stair_trunk_height", "foot_x", "foot_distance", "foot_yaw"),
@@ -255,7 +129,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
     down = u[0] < given.down_share
     rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
     stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))
-    hold_after = jnp.floor(_within(u[2], given.hold_after + jnp.array([0.0, 1.0])))
+    hold_after = jnp.floor(within(u[2], given.hold_after + jnp.array([0.0, 1.0])))
     v: Array = jax.random.uniform(jax.random.fold_in(key_task, 1), (3,))
     breaks = (v[0] < given.break_share) & ~still
     task = Task(
@@ -264,7 +138,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
         hold_after=jnp.where(u[1] < given.hold_share, hold_after, 1e6).astype(jnp.int32),
         mixes=(u[3] < given.mix_share) & ~on_stairs,
         key=key_mix,
-        break_every=jnp.where(breaks, jnp.floor(_within(v[1], jnp.array(_BREAKS))), 1e6).astype(jnp.int32),
+        break_every=jnp.where(breaks, jnp.floor(within(v[1], jnp.array(_BREAKS))), 1e6).astype(jnp.int32),
         pauses=v[2] < 0.5,
         push=jnp.where(u[4] < given.push_share, given.ranges["push"][1], 0.0),
     )
@@ -274,7 +148,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
     side = jnp.array([0.5, -0.5])
     ankles = jnp.stack([side * ahead, side * distance, jnp.full(2, robot.ankle_height + stairs.height)], axis=-1)
     yaws = jnp.where(still, draw["foot_yaw"] * 2 * side, jnp.zeros(2))
-    posture = _drawn_posture(_draw(key_posture, _POSTURE, given.ranges))
+    posture = _drawn_posture(sample(key_posture, _POSTURE, given.ranges))
     posture = jax.tree.map(functools.partial(jnp.where, still), posture, _upright(motion.trunk_height))
     return task, _over_feet(posture, ankles, yaws, robot)
 
@@ -321,7 +195,7 @@ def _foothold(motion: Motion, rise: Array, closes: Array, swing: Array, advance:
 
 def _anywhere(key: Array, given: Distribution, outwards: Array) -> Array:
     """The advance (3,) to a foothold within an ellipse of what can be reached; outwards: 1 for the left foot, else -1."""
-    draw = _draw(key, ("wander_x", "wander_y", "wander_yaw"), given.ranges)
+    draw = sample(key, ("wander_x", "wander_y", "wander_yaw"), given.ranges)
 
     def share(name: str) -> Array:
         """Of the way to the end of the range."""
@@ -347,7 +221,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     steps = (motion.kind >= WALK) & ~hold & ~(breaks & task.pauses)
 
     vary = jax.random.uniform(key_step, (3,))
-    vary = _within(vary, given.ranges["step_variation"])
+    vary = within(vary, given.ranges["step_variation"])
     bounds = given.ranges["period"]
     period = jnp.where(steps, jnp.clip(motion.period * vary[0], bounds[0], bounds[1]), 1.0)
     advance = jnp.where(motion.kind == STAIRS, motion.advance, motion.advance * vary[2])
@@ -361,7 +235,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     footholds, headings = _foothold(motion, task.stairs.rise, closes, swings, advance, start)
     ankles = _choose(steps, footholds, start.ankle_positions)
     yaws = _choose(steps, headings, start.ankle_yaws)
-    draw = _draw(key_posture, (*_POSTURE, "squat_period", "trigonometric", "swing_ease"), given.ranges)
+    draw = sample(key_posture, (*_POSTURE, "squat_period", "trigonometric", "swing_ease"), given.ranges)
     period = jnp.where(squats, draw["squat_period"], period)
     drawn, upright = _drawn_posture(draw), _upright(motion.trunk_height)
     share = jnp.where(squats, 1.0, 0.5 * wanders)  # a wanderer goes half of the way that one who stands may go
@@ -375,8 +249,8 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
         start.ankle_positions,
         ankles,
         lift,
-        along=jnp.array([0.05, 0.5, 0.95]) + _within(u[0], given.ranges["curve_along"]),
-        height=_within(u[1], given.ranges["curve_height"]),
+        along=jnp.array([0.05, 0.5, 0.95]) + within(u[0], given.ranges["curve_along"]),
+        height=within(u[1], given.ranges["curve_height"]),
     )
     return TaskStep(
         start=start,

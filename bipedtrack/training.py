@@ -32,6 +32,7 @@ from bipedtrack import (
     plans,
     policy,
     robot,
+    sampling,
     tasks,
     versions,
 )
@@ -52,7 +53,7 @@ class Stopped(Exception):
 
 def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: curriculum.Lesson) -> env.TrackingEnv:
     """The environment of a stage's lesson; only a stage with stairs has boxes."""
-    given = tasks.distribution(
+    given = sampling.distribution(
         config.ranges,
         stage.shares,
         lesson.difficulty,

@@ -251,13 +251,13 @@ def _record_task(options: Video, driven: policy.Policy) -> _Recorded:
     """An episode just as the evaluation has it."""
     import jax
 
-    from bipedtrack import evaluate, plans, suite, tasks
+    from bipedtrack import evaluate, plans, sampling, suite
 
     if options.task not in suite.TASKS:
         raise ValueError(f"--task {options.task}: no such task; there are: {', '.join(suite.TASKS)}")
     asked = evaluate.Evaluate((str(options.policy),), feedback_ratio=None if options.feedback else 0.0)
-    seconds = suite.duration(options.task, tasks.Ranges(), options.seconds or asked.seconds)
-    batch = suite.batch(options.task, tasks.Ranges(), driven.robot, options.episode + 1, seconds, asked.seed)
+    seconds = suite.duration(options.task, sampling.Ranges(), options.seconds or asked.seconds)
+    batch = suite.batch(options.task, sampling.Ranges(), driven.robot, options.episode + 1, seconds, asked.seed)
     batch = batch._replace(plan=jax.tree.map(lambda leaf: leaf[-1:], batch.plan))
     engines = evaluate.Engines(evaluate.subject(asked.policies[0], asked), "mujoco")
     recorded = engines.record("mujoco", batch, seconds).episode(0)

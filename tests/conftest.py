@@ -18,7 +18,7 @@ import pytest
 import reports
 from filmed import Rendered
 
-from bipedtrack import planner, tasks, video
+from bipedtrack import planner, sampling, tasks, video
 from bipedtrack import robot as robots
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.curriculum import load as load_curriculum
@@ -60,7 +60,7 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
     """Draws 300 episodes of 12 task steps: episodes(kind, difficulty=1.0, hold_after=None)."""
     count, steps, instants = 300, 12, 21
 
-    def one(key: Any, given: tasks.Distribution) -> tuple:
+    def one(key: Any, given: sampling.Distribution) -> tuple:
         key_begin, key_steps = jax.random.split(key)
         task, start = tasks.begin(key_begin, given, robot)
 
@@ -78,12 +78,12 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
     def draw(
         kind: str, difficulty: float = 1.0, hold_after: tuple[int, int] | None = None, break_share: float = 0.0
     ) -> Episodes:
-        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
+        shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
         hold_share = 0.0 if hold_after is None else 1.0
-        given = tasks.distribution(
+        given = sampling.distribution(
             curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8), break_share=break_share
         )
-        keys = jax.random.split(jax.random.PRNGKey(tasks.KINDS.index(kind)), count)
+        keys = jax.random.split(jax.random.PRNGKey(sampling.KINDS.index(kind)), count)
         return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
 
     return draw

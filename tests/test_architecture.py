@@ -19,7 +19,7 @@ LADDER = """
     config checkpoint
     rotations robot
     nodes kinematics trace packets
-    planner terrain feasibility rows
+    planner terrain sampling feasibility rows
     tasks footsteps scripts steering plans disturbances control observation rewards swings metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite pictures

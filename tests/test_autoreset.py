@@ -9,14 +9,14 @@ import pytest
 from brax.training.agents.ppo import losses
 from brax.training.logger import EpisodeMetricsLogger
 
-from bipedtrack import control, observation, rewards, tasks
+from bipedtrack import control, observation, rewards, sampling
 from bipedtrack import robot as robots
 from bipedtrack.autoreset import AutoReset
 from bipedtrack.env import EnvConfig, TrackingEnv
 
 QUICK_COMPILE = {"xla_backend_optimization_level": 0}  # these programs run a few times only
 ROBOTS, STEPS, LENGTH = 8, 40, 12
-SHARES = tasks.Shares(stand=1, squat=1, walk=1, sidle=1, turn=1, stairs=0)
+SHARES = sampling.Shares(stand=1, squat=1, walk=1, sidle=1, turn=1, stairs=0)
 # (step, robot) before which the robot is tipped over, or explodes; the last step of an episode, and its first, too
 TIPPED = ((4, 2), (11, 0), (12, 5), (30, 6), (31, 6), (39, 3))
 EXPLODED = ((20, 1),)
@@ -51,7 +51,7 @@ def disturbed(state: Any, step: int) -> Any:
 @pytest.fixture(scope="module")
 def recording() -> Recording:
     config = EnvConfig(rewards.RewardConfig(), control.ControlConfig(level_feet=True))
-    given = tasks.distribution(tasks.Ranges(), SHARES, 0.5, 0.0, (0, 0))
+    given = sampling.distribution(sampling.Ranges(), SHARES, 0.5, 0.0, (0, 0))
     env = AutoReset(TrackingEnv(robots.load(), config, given), LENGTH)
     step = jax.jit(env.step, compiler_options=QUICK_COMPILE)
     actions = np.random.default_rng(0).normal(size=(STEPS, ROBOTS, 12)).astype(np.float32)
@@ -120,7 +120,7 @@ def test_a_robot_that_exploded_is_reborn_finite(recording: Recording) -> None:
 
 def test_first_episodes_end_at_any_time_up_to_the_limit() -> None:
     config = EnvConfig(rewards.RewardConfig(), control.ControlConfig(level_feet=True))
-    given = tasks.distribution(tasks.Ranges(), SHARES, 0.5, 0.0, (0, 0))
+    given = sampling.distribution(sampling.Ranges(), SHARES, 0.5, 0.0, (0, 0))
     env = AutoReset(TrackingEnv(robots.load(), config, given), LENGTH)
     reset = jax.jit(env.reset, compiler_options=QUICK_COMPILE)
     clocks = np.asarray(reset(jax.random.split(jax.random.PRNGKey(3), 1200)).info["clock"])
@@ -156,7 +156,7 @@ def test_every_episode_is_another_one(recording: Recording) -> None:
         seen["posture"].add(np.asarray(episode.step.ankle_points)[i].tobytes())
         kinds.add(int(episode.task.motion.kind[i]))
     assert len(begun) > 25 and {name: len(values) for name, values in seen.items()} == dict.fromkeys(seen, len(begun))
-    assert kinds == {tasks.STAND, tasks.SQUAT, tasks.WALK, tasks.SIDLE, tasks.TURN}
+    assert kinds == {sampling.STAND, sampling.SQUAT, sampling.WALK, sampling.SIDLE, sampling.TURN}
 
 
 def test_the_action_of_a_step_that_begins_an_episode_does_nothing(recording: Recording) -> None:

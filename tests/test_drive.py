@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bipedtrack import drive as drives
-from bipedtrack import env, footsteps, kinematics, nodes, paths, policy, rotations, scripts, steering, tasks
+from bipedtrack import env, footsteps, kinematics, nodes, paths, policy, rotations, sampling, scripts, steering, tasks
 from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
 from bipedtrack.footsteps import Box
@@ -79,14 +79,14 @@ def test_steps_are_those_of_training(robot: robots.Robot) -> None:
     start = footsteps.initial_nodes(robot)
     for foot in range(2):
         for ahead, turn in ((0.2, 0.0), (-0.1, 0.25), (0.0, -0.35)):
-            motion = tasks.Motion(tasks.WALK, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75)
+            motion = tasks.Motion(sampling.WALK, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75)
             places, yaws = tasks._foothold(motion, 0.0, False, foot, motion.advance, start)
             mine = steering._moved_on(start, foot, np.array([ahead, 0.0, turn]))
             assert np.allclose(mine[1:], [*places[foot][:2], yaws[foot]], atol=1e-6)
 
 
 def test_limits_are_those_of_training() -> None:
-    ranges = tasks.Ranges()
+    ranges = sampling.Ranges()
     twins = {
         **{"period": "period", "lift": "lift", "turn_angle": "turn_yaw", "step_length": "walk_step"},
         **{"sidle_length": "sidle_step", "trunk_ahead": "posture_x", "trunk_aside": "posture_y"},
@@ -182,7 +182,7 @@ def test_a_script_written_down_reads_back_the_same(robot: robots.Robot) -> None:
 
 
 def test_every_kind_and_both_courses_lie_ready() -> None:
-    assert {*tasks.KINDS, "obstacles"} <= set(scripts.ready())
+    assert {*sampling.KINDS, "obstacles"} <= set(scripts.ready())
 
 
 # Drives with the policy that ships

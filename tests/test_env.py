@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bipedtrack import control, nodes, observation, planner, rewards, rotations, tasks
+from bipedtrack import control, nodes, observation, planner, rewards, rotations, sampling
 from bipedtrack import robot as robots
 from bipedtrack.env import EnvConfig, TrackingEnv
 
@@ -29,12 +29,12 @@ class Compiled(NamedTuple):
     traces: list[str]  # one entry for each time a function was compiled
 
 
-def distribution(kind: str, difficulty: float = 0.5, hold: bool = False) -> tasks.Distribution:
-    shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
-    return tasks.distribution(tasks.Ranges(), shares, difficulty, float(hold), (0, 0))
+def distribution(kind: str, difficulty: float = 0.5, hold: bool = False) -> sampling.Distribution:
+    shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
+    return sampling.distribution(sampling.Ranges(), shares, difficulty, float(hold), (0, 0))
 
 
-def stacked(kinds: tuple[str, ...], **options: Any) -> tasks.Distribution:
+def stacked(kinds: tuple[str, ...], **options: Any) -> sampling.Distribution:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(distribution(kind, **options) for kind in kinds))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rich.console
 
-from bipedtrack import control, curriculum, evaluation, observation, policy, robot, tasks
+from bipedtrack import control, curriculum, evaluation, observation, policy, robot, sampling
 from bipedtrack.evaluation import Row
 
 EPISODES, SECONDS = 3, 0.74  # 37 policy steps: too short for inverse kinematics to fall
@@ -16,7 +16,7 @@ EPISODES, SECONDS = 3, 0.74  # 37 policy steps: too short for inverse kinematics
 def plan() -> curriculum.Curriculum:
     """A curriculum of standing, walking and stairs, in whose last stage everything holds at once."""
     smoke = curriculum.load("smoke")
-    flat = tasks.Shares(stand=1, squat=0, walk=1, sidle=0, turn=0, stairs=0)
+    flat = sampling.Shares(stand=1, squat=0, walk=1, sidle=0, turn=0, stairs=0)
     stages = (
         dataclasses.replace(smoke.stages[0], shares=flat),
         dataclasses.replace(smoke.stages[2], shares=flat._replace(stand=0, stairs=2), hold_after=(0, 0)),

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from walks import HEADER
 
-from bipedtrack import footsteps, planner, plans, rotations, tasks, terrain
+from bipedtrack import footsteps, planner, plans, rotations, sampling, tasks, terrain
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import Command, TaskStep
 from bipedtrack.plans import PLANNED, Plan, library, mirrored, script_plan, step_numbers, with_scripts
@@ -20,7 +20,7 @@ from bipedtrack.robot import Robot
 STEPS = 7
 # kind, share of the stairs that go down, number of task steps before a hold
 CASES = {
-    **{kind: (kind, 0.0, None) for kind in tasks.KINDS},
+    **{kind: (kind, 0.0, None) for kind in sampling.KINDS},
     "stairs down": ("stairs", 1.0, None),
     "walk and hold": ("walk", 0.0, 3),
     "stairs and hold": ("stairs", 0.0, 4),
@@ -55,10 +55,10 @@ def at(tree: Any, index: Any) -> Any:
 def laid(robot: Robot, unoptimised: None) -> Laid:
     """A random plan of each case, and its steps one by one: a key for the beginning and then one for each task step."""
 
-    def distribution(kind: str, down: float, hold: int | None) -> tasks.Distribution:
-        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
+    def distribution(kind: str, down: float, hold: int | None) -> sampling.Distribution:
+        shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
         after = (hold or 1, hold or 8)
-        return tasks.distribution(tasks.Ranges(), shares, 1.0, float(hold is not None), after, down)
+        return sampling.distribution(sampling.Ranges(), shares, 1.0, float(hold is not None), after, down)
 
     given = jax.tree.map(lambda *leaves: np.stack(leaves), *(distribution(*case) for case in CASES.values()))
     keys = jax.random.split(jax.random.PRNGKey(3), len(CASES))
@@ -270,7 +270,7 @@ def test_a_share_of_the_episodes_follows_the_scripts_at_a_pace_of_its_own(robot:
     short, long = (footsteps.parse(HEADER + text, robot, "a.csv") for text in ("jump,0.1\n", SCRIPT))
     stock = library([short, long])
     assert stock.boxes.shape == (4, 5, 3, 7) and (stock.boxes[..., 2] < -5).all()
-    given = tasks.distribution(tasks.Ranges(), tasks.Shares(0, 0, 1, 0, 0, 0), 1.0, 0.0, (1, 8))
+    given = sampling.distribution(sampling.Ranges(), sampling.Shares(0, 0, 1, 0, 0, 0), 1.0, 0.0, (1, 8))
     source = with_scripts(tasks.RANDOM, stock, 0.5)
 
     @jax.jit

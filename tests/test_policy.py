@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bipedtrack
-from bipedtrack import checkpoint, control, curriculum, footsteps, observation, planner, policy, robot, tasks, training
+from bipedtrack import checkpoint, control, curriculum, footsteps, observation, planner, policy, robot, sampling, training
 from bipedtrack.control import ControlConfig
 from bipedtrack.env import EnvConfig, TrackingEnv
 from bipedtrack.policy import Controller, Network, Policy, PolicyError
@@ -134,8 +134,8 @@ def make_env(policy_period, settings):
 
 
 def drawn(kind, hold=False, ranges=None, difficulty=1.0):
-    shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
-    return tasks.distribution(ranges or tasks.Ranges(), shares, difficulty, float(hold), (1, 1))
+    shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
+    return sampling.distribution(ranges or sampling.Ranges(), shares, difficulty, float(hold), (1, 1))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def env_50_hz():
     return make_env(0.02, ControlConfig())
 
 
-CASES = [(kind, False) for kind in tasks.KINDS] + [("walk", True)]
+CASES = [(kind, False) for kind in sampling.KINDS] + [("walk", True)]
 
 
 @pytest.mark.parametrize(("kind", "hold"), CASES)
@@ -226,7 +226,7 @@ def walk():
 def test_in_mujoco_c_a_script_is_walked_as_in_mjx(env_50_hz, walk):
     # the environment draws the script's steps when its ranges leave it no choice
     env, begin, step = env_50_hz
-    no_choice = drawn("walk", ranges=tasks.Ranges()._replace(walk_step=(0.1, 0.1, 0.1)), difficulty=0.0)
+    no_choice = drawn("walk", ranges=sampling.Ranges()._replace(walk_step=(0.1, 0.1, 0.1)), difficulty=0.0)
     starts = (begin(jax.random.PRNGKey(seed), no_choice) for seed in range(20))
     start = next(start for start in starts if start.info["episode"].task.motion.first == 0)  # the left foot steps first
     commands = list(footsteps.commands(walk, ROBOT.timestep, 1.0))

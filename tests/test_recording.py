@@ -22,7 +22,7 @@ from bipedtrack import (
     policy,
     recording,
     rewards,
-    tasks,
+    sampling,
     terrain,
 )
 from bipedtrack import robot as robots
@@ -52,10 +52,10 @@ def first() -> policy.Policy:
 def plan(robot: robots.Robot) -> plans.Plan:
     """An episode of each of KINDS. The last hurries: its task steps of 0.15 s are over before the recording is."""
 
-    def given(kind: str) -> tasks.Distribution:
-        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
-        ranges = tasks.Ranges()._replace(walk_step=(0.03, 0.03, 0.25))
-        return tasks.distribution(ranges, shares, 0.0 if kind == "stairs" else 1.0, 0.0, (0, 0), down_share=1.0)
+    def given(kind: str) -> sampling.Distribution:
+        shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
+        ranges = sampling.Ranges()._replace(walk_step=(0.03, 0.03, 0.25))
+        return sampling.distribution(ranges, shares, 0.0 if kind == "stairs" else 1.0, 0.0, (0, 0), down_share=1.0)
 
     drawn = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(given, KINDS))
     lay_out = jax.jit(jax.vmap(lambda key, one: plans.random_plan(key, one, robot, TASK_STEPS)))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bipedtrack import control, observation, rewards, robot, rollout, tasks
+from bipedtrack import control, observation, rewards, robot, rollout, sampling
 from bipedtrack.env import EnvConfig, TrackingEnv
 
 QUICK_COMPILE = {"xla_backend_optimization_level": 0}  # these programs run once
@@ -20,10 +20,10 @@ def act(flat_observation: jax.Array) -> jax.Array:
     return jnp.where(swings, -5.0, 0.0) * jnp.asarray(ANKLE_PITCH, jnp.float32)
 
 
-def batch() -> tasks.Distribution:
-    def of(kind: str) -> tasks.Distribution:
-        shares = tasks.Shares(**{name: float(name == kind) for name in tasks.KINDS})
-        return tasks.distribution(tasks.Ranges(), shares, 0.5, 0.0, (0, 0))
+def batch() -> sampling.Distribution:
+    def of(kind: str) -> sampling.Distribution:
+        shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
+        return sampling.distribution(sampling.Ranges(), shares, 0.5, 0.0, (0, 0))
 
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(of, KINDS))
 

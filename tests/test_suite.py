@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from bipedtrack import planner, plans, scripts, suite, tasks
+from bipedtrack import planner, plans, sampling, scripts, suite
 from bipedtrack.robot import Robot
 from bipedtrack.suite import Batch, Level
 
@@ -32,7 +32,7 @@ def draw(robot: Robot, unoptimised: None) -> Draw:
     """Draws a task's batch: draw(name, episodes=18, seconds=72, seed=7, **ranges)."""
 
     def draw(name: str, episodes: int = EPISODES, seconds: float = LONGEST, seed: int = SEED, **ranges: tuple) -> Batch:
-        return suite.batch(name, tasks.Ranges()._replace(**ranges), robot, episodes, seconds, seed)
+        return suite.batch(name, sampling.Ranges()._replace(**ranges), robot, episodes, seconds, seed)
 
     return draw
 
@@ -93,7 +93,7 @@ def test_every_task_has_a_name_of_its_own() -> None:
 
 
 def test_an_episode_lasts_as_long_as_asked_and_a_hold_that_long_after_eight_steps() -> None:
-    ranges = tasks.Ranges()
+    ranges = sampling.Ranges()
     for name in BASE:
         assert suite.duration(name, ranges, 10.0) == 10.0
         assert suite.duration(name, ranges, 3.5) == 3.5
@@ -283,7 +283,7 @@ def test_a_hold_stands_still_for_as_long_as_promised_after_one_to_eight_steps(na
     assert set(before) <= set(range(1, 9)) and len(set(before)) >= 5
     assert (goes == (np.arange(goes.shape[1]) < before[:, None])).all()  # and never again
     began = (plan.steps.period.astype(np.float64) * goes).sum(axis=1)
-    lasts = suite.duration(name, tasks.Ranges(), 10.0) - began
+    lasts = suite.duration(name, sampling.Ranges(), 10.0) - began
     promised = 60 if "60s" in name else 10
     assert lasts.min() >= promised - 1e-4
     # what the robot is told
@@ -384,7 +384,7 @@ def written(path: pathlib.Path) -> tuple[list[dict[str, str]], list[list[float]]
 @pytest.mark.parametrize("name", ["obstacles", "composite"])
 def test_a_script_is_the_same_in_every_episode_and_as_it_is_written(name: str, robot: Robot) -> None:
     rows, boxes = written(scripts.ready()[name])
-    batch = suite.batch(name, tasks.Ranges(), robot, 3, 10.0, SEED)
+    batch = suite.batch(name, sampling.Ranges(), robot, 3, 10.0, SEED)
     steps = batch.plan.steps
     assert steps.period.shape == (3, len(rows) + 1)  # and at last the end is held
     assert all((leaf == leaf[:1]).all() for leaf in jax.tree.leaves(batch.plan))
@@ -405,6 +405,6 @@ def test_a_script_is_the_same_in_every_episode_and_as_it_is_written(name: str, r
 
 @pytest.mark.parametrize(("task", "ease"), [("walk-forward", 0.2), ("walk-forward-uniform", 0), ("stairs-up-uniform", 0)])
 def test_only_what_says_so_has_swings_that_are_run_through_uniformly(robot: Robot, task: str, ease: float) -> None:
-    drawn = suite.batch(task, tasks.Ranges(), robot, 4, 2.0, 0)
+    drawn = suite.batch(task, sampling.Ranges(), robot, 4, 2.0, 0)
     assert (drawn.plan.steps.ease >= ease - 1e-6).all() and (drawn.plan.steps.ease <= ease + 0.1 * (ease > 0) + 1e-6).all()
     assert ("uniformly" in drawn.ranges) == (ease == 0)

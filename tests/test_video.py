@@ -12,7 +12,7 @@ import pytest
 from filmed import SCRIPT, SIZE, Rendered, differences, green, moved, walk, yellow
 from PIL import Image
 
-from bipedtrack import control, doctor, evaluate, observation, policy, suite, tasks, video
+from bipedtrack import control, doctor, evaluate, observation, policy, sampling, suite, video
 from bipedtrack import robot as robots
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -202,7 +202,7 @@ def test_command_line_films_the_evaluations_own_episode(inputs: Path, tmp_path: 
     found = run(inputs, "--out", str(out), "--seconds", "0.2", "--size", "64", "48", what="--task stairs-up --episode 4")
     assert found.returncode == 0 and found.stdout.startswith("0.2 s, no fall; mean error: ankles "), found.stderr
     # the fifth cell of the grid has the highest riser, and the evaluation's trace starts where the film does
-    batch = suite.batch("stairs-up", tasks.Ranges(), robots.load(), 5, 0.2, evaluate.SEED)
+    batch = suite.batch("stairs-up", sampling.Ranges(), robots.load(), 5, 0.2, evaluate.SEED)
     assert batch.plan.steps.end.ankle_positions[4, 0, :, 2].max() == pytest.approx(0.04 + 0.17)
     with Image.open(out) as strip:
         assert strip.size == (6 * 30, 48)
