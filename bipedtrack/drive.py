@@ -13,12 +13,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bipedtrack import control, footsteps, kinematics, nodes, planner, policy, rotations, scripts, simulate, steering
+from bipedtrack import (
+    control,
+    footholds,
+    footsteps,
+    kinematics,
+    nodes,
+    planner,
+    policy,
+    rotations,
+    scripts,
+    simulate,
+    steering,
+)
+from bipedtrack.footholds import Foothold
 from bipedtrack.footsteps import Box, Script
 from bipedtrack.nodes import NodeErrors, Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import LEGS
-from bipedtrack.steering import Foothold, Planned, Steering, Wishes
+from bipedtrack.steering import Planned, Steering, Wishes
 
 # When a robot counts as fallen, as in training (env.EnvConfig).
 FALL_TILT_DEG = 60.0
@@ -206,7 +219,7 @@ class Drive:
             raise ValueError(f"foothold {wanted[1:]}: wanted finite numbers")
         planned = steering.place(self.robot, self.boxes, self.step.end, wanted, self.steering)
         if planned.step.swing.any():
-            self.wishes = self.wishes._replace(placed=steering.end_of(planned.step, wanted.foot))
+            self.wishes = self.wishes._replace(placed=footholds.end_of(planned.step, wanted.foot))
         self.note = planned.note
         return planned.note
 
@@ -278,7 +291,7 @@ class Drive:
             steering=self.steering,
             boxes=self.boxes,
             prints=self._prints(),
-            next_foot=self.wishes.placed or steering.beside(end, self.wishes.foot),
+            next_foot=self.wishes.placed or footholds.beside(end, self.wishes.foot),
             step=self.step,
         )
 
@@ -336,7 +349,7 @@ class Drive:
         for step in (self.step, *ahead):
             for foot in range(len(LEGS)):
                 if step.swing[foot]:
-                    found.append(steering.end_of(step, foot))
+                    found.append(footholds.end_of(step, foot))
         return tuple(found)
 
 

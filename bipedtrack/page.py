@@ -12,7 +12,7 @@ import numpy as np
 import viser
 import viser.uplot
 
-from bipedtrack import footsteps, policy, scripts, steering
+from bipedtrack import footholds, footsteps, policy, scripts, steering
 from bipedtrack.drive import Drive, Mode, View
 from bipedtrack.realtime import VIEW_SECONDS, RealTime, Sample
 from bipedtrack.scene import Scene
@@ -296,7 +296,7 @@ class Page:
 
     # What is within reach is searched in the viewer's own thread, for it takes long: the drive goes on meanwhile.
 
-    def _wanted_foothold(self, view: View) -> steering.Foothold:
+    def _wanted_foothold(self, view: View) -> footholds.Foothold:
         return self.scene.foothold(view.next_foot.foot)
 
     def _reaches_foot(self) -> bool:
@@ -309,7 +309,7 @@ class Page:
         planned = steering.place(self._robot, view.boxes, view.step.end, wanted, view.steering)
         possible = planned.step.swing.any()
         if possible:
-            self._ask(lambda drive: drive.place(steering.end_of(planned.step, wanted.foot)))
+            self._ask(lambda drive: drive.place(footholds.end_of(planned.step, wanted.foot)))
         if planned.note:
             self._say(planned.note, wrong=not possible)
 

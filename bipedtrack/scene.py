@@ -13,9 +13,10 @@ import viser
 
 from bipedtrack import footsteps, robot, rotations, steering
 from bipedtrack.drive import View
+from bipedtrack.footholds import Foothold
 from bipedtrack.footsteps import Box
 from bipedtrack.nodes import Nodes
-from bipedtrack.steering import Foothold, Steering
+from bipedtrack.steering import Steering
 
 TARGET_COLOR = (0, 204, 0)
 MEASURED_COLOR = (255, 217, 0)

@@ -1,4 +1,4 @@
-"""From what a person asks for to the next task step: steering, footholds by hand, and the ground under them.
+"""From what a person asks for to the next task step: steering, and footholds by hand.
 
 A task step is made of the cells of a footstep script's line, so that every drive can be written down as a script.
 """
@@ -6,30 +6,25 @@ A task step is made of the cells of a footstep script's line, so that every driv
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from bipedtrack import footsteps, kinematics, rotations
+from bipedtrack import footholds, footsteps, kinematics, rotations
+from bipedtrack.footholds import Foothold
 from bipedtrack.footsteps import Box
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import LEGS, Robot
 
-FOOT_DISTANCE = 0.2  # m between the ankles of feet side by side
 HOLD_SECONDS = 0.1  # of a task step that holds: soon enough for the next wish
 TRUNK_SECONDS = 1.0  # of a task step that moves the trunk alone
 _BACKWARD = 0.15  # m, the longest step backward in training
-_RISE = 0.2  # m, the highest step up or down that is tried
-_REACH = 0.36  # m, the longest step onto a tread
-_HALF_TREAD = 0.15  # m from an edge to a foothold on ground that is longer than a tread
-_MARGIN = 0.02  # m between a sole and an edge
 _CLEARANCE = 0.06  # m by which a foot is lifted over what it crosses
 _BOX_SECONDS = 0.65  # at least, of a step that crosses an edge
 _HIGH_SWING = 0.4  # m, the longest way of a foot that is lifted higher than LIMITS
 _KNOWN = (0.35, 0.24, 0.35)  # m ahead, m outwards and rad from beside the other foot: the farthest foothold in training
-_GRAIN = 0.01  # m between two looks at the ground
 
 
 class Steering(NamedTuple):
@@ -70,15 +65,6 @@ LIMITS = {
     "trunk_yaw": (-0.3, 0.3),
 }
 """Least and greatest value of each number of Steering: what policies are trained for (sampling.Ranges)."""
-
-
-class Foothold(NamedTuple):
-    """A place for a foot."""
-
-    foot: int  # 0 left, 1 right
-    x: float  # m, of the point under the ankle
-    y: float
-    yaw: float  # rad
 
 
 class Planned(NamedTuple):
@@ -133,17 +119,6 @@ def first_foot(asked: Steering, otherwise: int) -> int:
     return otherwise if not side else int(side < 0)
 
 
-def beside(start: Nodes, foot: int) -> Foothold:
-    """Where the foot stands side by side with the other one."""
-    return _moved_on(start, foot, np.zeros(3))
-
-
-def end_of(step: TaskStep, foot: int) -> Foothold:
-    """The foothold at which a foot ends."""
-    x, y, _ = step.end.ankle_positions[foot]
-    return Foothold(foot, float(x), float(y), float(step.end.ankle_yaws[foot]))
-
-
 def walk(robot: Robot, boxes: Sequence[Box], start: Nodes, foot: int, asked: Steering) -> Planned:
     """The task step that moves on as asked: the foot goes beside the other one, and on from there.
 
@@ -160,7 +135,9 @@ def walk(robot: Robot, boxes: Sequence[Box], start: Nodes, foot: int, asked: Ste
     )
     problems: list[str] = []
     for share in (1.0, 0.75, 0.5, 0.25, 0.0):
-        wanted = on_ground(robot, boxes, beside(start, foot), _moved_on(start, foot, share * advance))
+        wanted = footholds.on_ground(
+            robot, boxes, footholds.beside(start, foot), footholds.moved_on(start, foot, share * advance)
+        )
         step = step_to(robot, boxes, start, wanted, asked)
         found = footsteps.problems_of(robot, boxes, step) or _too_long(step, foot)
         if not found:
@@ -208,10 +185,10 @@ def place(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold, as
     found_wrong = problems(robot, boxes, start, wanted, asked)
     if not found_wrong:
         return Planned(at(wanted.x, wanted.y))
-    home = beside(start, wanted.foot)
+    home = footholds.beside(start, wanted.foot)
     turned = home.yaw + min(max(rotations.wrap(wanted.yaw - home.yaw), -_KNOWN[2]), _KNOWN[2])
     wanted = wanted._replace(yaw=float(turned))
-    found = nearest(
+    found = footholds.nearest(
         lambda point: not problems(robot, boxes, start, wanted._replace(x=point[0], y=point[1]), asked),
         np.array([wanted.x, wanted.y]),
         np.array([home.x, home.y]),
@@ -225,8 +202,8 @@ def place(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold, as
 
 def problems(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold, asked: Steering) -> list[str]:
     """What keeps the robot from a foothold, one sentence each: reach, ground, or a step longer than any in training."""
-    home = beside(start, wanted.foot)
-    x, y = _turned(-home.yaw, np.array([wanted.x - home.x, wanted.y - home.y]))
+    home = footholds.beside(start, wanted.foot)
+    x, y = footholds.turned(-home.yaw, np.array([wanted.x - home.x, wanted.y - home.y]))
     turn = rotations.wrap(wanted.yaw - home.yaw)
     ahead, aside, around = _KNOWN
     found = []
@@ -236,28 +213,6 @@ def problems(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold,
             f"other foot; wanted at most {100 * ahead:.0f} cm, {100 * aside:.0f} cm and {math.degrees(around):.0f} deg"
         )
     return found + footsteps.problems_of(robot, boxes, step_to(robot, boxes, start, wanted, asked))
-
-
-def nearest(possible: Callable[[np.ndarray], bool], wanted: np.ndarray, home: np.ndarray) -> np.ndarray | None:
-    """The possible point nearest to the wanted one, both (2,) m, to about 3 mm of distance; None where home is not possible.
-
-    The way from home ends where the possible ones do; from there every direction that leads nearer is tried.
-    """
-    best = home + _share(possible, wanted, home) * (wanted - home)
-    if not possible(best):
-        return None
-    turns = np.linspace(0, 2 * math.pi, 12, endpoint=False)
-    compass = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    stride = 0.05
-    while stride > 0.003:
-        nearer = [p for p in best + stride * compass if math.dist(p, wanted) < math.dist(best, wanted) - 1e-9]
-        nearer.sort(key=lambda point: math.dist(point, wanted))
-        better = next(filter(possible, nearer), None)
-        if better is None:
-            stride /= 2
-        else:
-            best = better
-    return best
 
 
 def lean(robot: Robot, boxes: Sequence[Box], start: Nodes, asked: Steering) -> tuple[Steering, str]:
@@ -276,79 +231,14 @@ def lean(robot: Robot, boxes: Sequence[Box], start: Nodes, asked: Steering) -> t
     if not found:
         note = "the trunk was kept within what the policy knows" if within != asked else ""
         return within, note
-    share = _share(lambda trunk: not problems(trunk), wanted, home)
+    share = footholds.share_of_way(lambda trunk: not problems(trunk), wanted, home)
     return wish(home + share * (wanted - home)), f"the trunk was brought back within reach: {found[0]}"
-
-
-def on_ground(robot: Robot, boxes: Sequence[Box], home: Foothold, wanted: Foothold) -> Foothold:
-    """A foothold on the way from home where the whole sole finds ground of one height, near the wanted one.
-
-    Where the way reaches an edge the foot goes to the middle of the next tread, or half a tread beyond the edge; from too
-    far away, or before what is too high, it stays half a tread before the edge.
-    """
-    if not boxes:
-        return wanted
-    way = np.array([wanted.x - home.x, wanted.y - home.y])
-    distance = float(np.hypot(*way))
-    direction = way / distance if distance > 1e-6 else np.array([math.cos(home.yaw), math.sin(home.yaw)])
-    cosine = abs(float(direction @ [math.cos(wanted.yaw), math.sin(wanted.yaw)]))
-    sine = math.sqrt(max(0.0, 1 - cosine * cosine))
-    half_length, half_width = robot.sole / 2
-    half = half_length * cosine + half_width * sine + _MARGIN
-    across = (half_length * sine + half_width * cosine) * np.array([-direction[1], direction[0]])
-
-    def height(s: float) -> float:
-        middle = np.array([home.x, home.y]) + s * direction
-        return max(footsteps.ground(boxes, *(middle + side * across)) for side in (-1, 0, 1))
-
-    stretches = _stretches(height, -0.3, max(distance, _REACH) + 0.3)
-    here = next(i for i, (_, end, _) in enumerate(stretches) if end > 0)
-    end, level = stretches[here][1:]
-    if distance + half <= end:
-        return wanted
-    reached = max(0.0, min(distance, end - _HALF_TREAD))
-    for first, last, top in stretches[here + 1 :]:
-        if abs(top - level) > _RISE:
-            break
-        if last - first >= 2 * half:
-            middle = first + min((last - first) / 2, _HALF_TREAD)
-            reached = middle if middle <= _REACH else reached
-            break
-    return wanted._replace(x=home.x + reached * direction[0], y=home.y + reached * direction[1])
-
-
-def _stretches(height: Callable[[float], float], first: float, last: float) -> list[tuple[float, float, float]]:
-    """Stretches of ground of one height along a way: begin, end and height of each, m."""
-    stretches: list[tuple[float, float, float]] = []
-    for s in np.arange(first, last, _GRAIN):
-        top = height(float(s))
-        if stretches and abs(stretches[-1][2] - top) < 1e-3:
-            stretches[-1] = (stretches[-1][0], float(s) + _GRAIN / 2, top)
-        else:
-            stretches.append((float(s) - _GRAIN / 2, float(s) + _GRAIN / 2, top))
-    return stretches
-
-
-def _moved_on(start: Nodes, foot: int, advance: np.ndarray) -> Foothold:
-    """The foothold beside the other foot, moved on by x m, y m and yaw rad, (3,), as `tasks` has it."""
-    stance = 1 - foot
-    position, yaw = start.ankle_positions[stance, :2], float(start.ankle_yaws[stance])
-    side = np.array([0.5, -0.5]) * FOOT_DISTANCE
-    middle = position + _turned(yaw, np.array([advance[0], advance[1] - side[stance]]))
-    x, y = middle + _turned(yaw + advance[2], np.array([0.0, side[foot]]))
-    return Foothold(foot, float(x), float(y), yaw + float(advance[2]))
-
-
-def _turned(yaw: float, vector: np.ndarray) -> np.ndarray:
-    """A vector (2,) turned about the vertical."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
 def _trunk(robot: Robot, ankles: np.ndarray, yaws: np.ndarray, asked: Steering) -> dict[str, float]:
     """The trunk's cells of a script's line that ends with ankles (2, 3), m, and yaws (2,), rad."""
     yaw = float(yaws.mean())
-    centre = ankles[:, :2].mean(axis=0) + _turned(yaw, np.array([asked.trunk_ahead, asked.trunk_aside]))
+    centre = ankles[:, :2].mean(axis=0) + footholds.turned(yaw, np.array([asked.trunk_ahead, asked.trunk_aside]))
     height = float(ankles[:, 2].mean()) - robot.ankle_height + asked.trunk_height
     orientation = rotations.from_euler(asked.trunk_roll, asked.trunk_pitch, yaw + asked.trunk_yaw)
     posture = Nodes(np.array([*centre, height]), orientation, ankles, yaws)
@@ -368,19 +258,10 @@ def _lift(robot: Robot, boxes: Sequence[Box], start: Nodes, to: Foothold, asked:
     if not boxes:
         return asked.lift, False
     x, y, ankle = start.ankle_positions[to.foot]
-    way = np.linspace([x, y], [to.x, to.y], 2 + math.ceil(math.dist((x, y), (to.x, to.y)) / (2 * _GRAIN)))
+    way = np.linspace([x, y], [to.x, to.y], 2 + math.ceil(math.dist((x, y), (to.x, to.y)) / (2 * footholds.GRAIN)))
     heights = [footsteps.ground(boxes, *point) for point in way]
     ends = max(float(ankle) - robot.ankle_height, heights[-1])
     return max(asked.lift, max(heights) - ends + _CLEARANCE), max(heights) - min(heights) > 1e-3
-
-
-def _share(possible: Callable[[np.ndarray], bool], wanted: np.ndarray, home: np.ndarray) -> float:
-    """The greatest share of the way from home to the wanted point that is possible, to within 1 %."""
-    low, high = 0.0, 1.0
-    while high - low > 0.01:
-        middle = (low + high) / 2
-        low, high = (middle, high) if possible(home + middle * (wanted - home)) else (low, middle)
-    return low
 
 
 def same_trunk(start: Nodes, end: Nodes) -> bool:
@@ -396,7 +277,7 @@ def trunk_at(robot: Robot, start: Nodes, position: np.ndarray, orientation: np.n
     middle = start.ankle_positions.mean(axis=0) - np.array([0.0, 0.0, robot.ankle_height])
     position, orientation = np.asarray(position, float), np.asarray(orientation, float)
     posture = start._replace(trunk_position=position, trunk_orientation=orientation)
-    ahead, aside = _turned(-yaw, (kinematics.centre_of_mass_at(robot, posture) - middle)[:2])
+    ahead, aside = footholds.turned(-yaw, (kinematics.centre_of_mass_at(robot, posture) - middle)[:2])
     roll, pitch, turned = rotations.to_euler(orientation)
     return asked._replace(
         trunk_ahead=float(ahead),

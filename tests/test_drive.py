@@ -1,19 +1,17 @@
-"""A robot under somebody's hands: footholds worked by hand, and the shipped policy driven without a page."""
+"""The shipped policy under somebody's hands, driven without a page."""
 
 import math
 import sys
 
-import mujoco
 import numpy as np
 import pytest
 
 from bipedtrack import drive as drives
-from bipedtrack import env, footsteps, kinematics, nodes, paths, policy, rotations, sampling, scripts, steering, tasks
+from bipedtrack import env, footsteps, nodes, paths, policy, rotations, scripts
 from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
+from bipedtrack.footholds import Foothold
 from bipedtrack.footsteps import Box
-from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
-from bipedtrack.steering import Foothold, Steering
 
 
 @pytest.fixture(scope="module")
@@ -35,157 +33,6 @@ def go(drive: Drive, seconds: float) -> np.ndarray:
 
 def ground(robot: robots.Robot, name: str) -> tuple[Box, ...]:
     return footsteps.load(scripts.ready()[name], robot).boxes
-
-
-# Steering: footholds worked by hand. Feet begin at (0, ±0.1), the ankles 0.04 m above their soles.
-
-
-def centre_of_mass(robot: robots.Robot, nodes: Nodes) -> np.ndarray:
-    """MuJoCo's centre of mass, (2,) m, of the robot on its nodes."""
-    data = mujoco.MjData(robots.build_model(robot.name))
-    joints = kinematics.inverse(robot, *ankles_in_trunk_frame(nodes))
-    data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, joints])
-    mujoco.mj_kinematics(data.model, data)
-    mujoco.mj_comPos(data.model, data)
-    return data.subtree_com[0][:2].copy()
-
-
-def test_walking_puts_the_foot_one_step_ahead_of_the_other(robot: robots.Robot) -> None:
-    asked = Steering(ahead=1.0, step_length=0.2, lift=0.1, period=0.6, trunk_height=0.74)
-    step = steering.walk(robot, (), footsteps.initial_nodes(robot), 0, asked).step
-    assert np.allclose(step.end.ankle_positions, [[0.2, 0.1, 0.04], [0, -0.1, 0.04]])
-    assert np.allclose(step.end.trunk_position[1:], [0, 0.74])
-    assert np.allclose(centre_of_mass(robot, step.end), [0.1, 0], atol=1e-3)
-    assert (step.period, *step.swing, *step.lift) == (pytest.approx(0.6), 1, 0, 0.1, 0)
-    following = steering.walk(robot, (), step.end, 1, asked).step
-    assert np.allclose(following.end.ankle_positions, [[0.2, 0.1, 0.04], [0.4, -0.1, 0.04]])
-
-
-@pytest.mark.parametrize(("foot", "y"), [(0, 0.1 + 2 * 0.06), (1, -0.1)])
-def test_to_the_left_the_left_foot_opens_and_the_right_one_stays_beside(robot: robots.Robot, foot: int, y: float) -> None:
-    step = steering.walk(robot, (), footsteps.initial_nodes(robot), foot, Steering(aside=1.0, sidle_length=0.06)).step
-    assert np.allclose(step.end.ankle_positions[foot], [0, y, 0.04])
-
-
-def test_turning_moves_the_foot_about_the_place_between_the_feet(robot: robots.Robot) -> None:
-    step = steering.walk(robot, (), footsteps.initial_nodes(robot), 0, Steering(turn=1.0, turn_angle=0.3)).step
-    assert np.allclose(step.end.ankle_positions[0], [-0.1 * math.sin(0.3), 0.1 * math.cos(0.3), 0.04])
-    assert np.allclose(step.end.ankle_yaws, [0.3, 0])
-    assert np.allclose(rotations.to_euler(step.end.trunk_orientation), [0, 0, 0.15])
-
-
-def test_steps_are_those_of_training(robot: robots.Robot) -> None:
-    """The same advance gives the same foothold as the task steps that a policy learns from."""
-    start = footsteps.initial_nodes(robot)
-    for foot in range(2):
-        for ahead, turn in ((0.2, 0.0), (-0.1, 0.25), (0.0, -0.35)):
-            motion = tasks.Motion(sampling.WALK, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75)
-            places, yaws = tasks._foothold(motion, 0.0, False, foot, motion.advance, start)
-            mine = steering._moved_on(start, foot, np.array([ahead, 0.0, turn]))
-            assert np.allclose(mine[1:], [*places[foot][:2], yaws[foot]], atol=1e-6)
-
-
-def test_limits_are_those_of_training() -> None:
-    ranges = sampling.Ranges()
-    twins = {
-        **{"period": "period", "lift": "lift", "turn_angle": "turn_yaw", "step_length": "walk_step"},
-        **{"sidle_length": "sidle_step", "trunk_ahead": "posture_x", "trunk_aside": "posture_y"},
-        **{"trunk_height": "posture_height", "trunk_roll": "posture_roll", "trunk_pitch": "posture_pitch"},
-        "trunk_yaw": "posture_yaw",
-    }
-    assert set(twins) == set(steering.LIMITS)
-    for mine, theirs in twins.items():
-        low, _, high = getattr(ranges, theirs)
-        assert steering.LIMITS[mine][1] == high
-        assert steering.LIMITS[mine][0] >= low
-    assert steering.FOOT_DISTANCE == tasks.FOOT_DISTANCE
-
-
-def test_wishes_are_clamped_and_nonsense_becomes_the_default() -> None:
-    asked = steering.clamped(Steering(ahead=7.0, period=99.0, lift=-1.0, trunk_height=math.nan))
-    assert (asked.ahead, asked.period, asked.lift, asked.trunk_height) == (1.0, 0.7, 0.04, footsteps.TRUNK_HEIGHT)
-
-
-TREADS = (Box(0.45, 0, 0, 0, 0.3, 1.2, 0.1), Box(0.75, 0, 0, 0, 0.3, 1.2, 0.2))  # edges at 0.30, 0.60 and 0.90 m
-
-
-@pytest.mark.parametrize(
-    ("boxes", "home", "wanted", "x"),
-    [
-        ((), 0.0, 0.25, 0.25),
-        (TREADS, 0.0, 0.15, 0.15),  # the sole ends 5 cm before the edge
-        (TREADS, 0.0, 0.25, 0.15),  # too far to the tread's middle: half a tread before the edge
-        (TREADS, 0.15, 0.30, 0.45),  # across the edge: the middle of the tread
-        (TREADS, 0.45, 0.48, 0.48),  # still on the tread
-        (TREADS, 0.45, 0.60, 0.75),
-        ((Box(0.3, 0, 0, 0, 0.04, 1, 0.06),), 0.13, 0.3, 0.32 + 0.15),  # a bar is stepped over
-        ((Box(0.6, 0, 0, 0, 0.6, 1, 0.4),), 0.1, 0.3, 0.15),  # a wall is not
-    ],
-)
-def test_footholds_before_on_and_over_boxes(
-    robot: robots.Robot, boxes: tuple[Box, ...], home: float, wanted: float, x: float
-) -> None:
-    found = steering.on_ground(robot, boxes, Foothold(0, home, 0.1, 0.0), Foothold(0, wanted, 0.1, 0.0))
-    assert found.x == pytest.approx(x, abs=0.011)
-    assert found[2:] == (pytest.approx(0.1), 0.0)
-
-
-def test_the_nearest_possible_point_of_a_disc() -> None:
-    wanted = np.array([3.0, 4.0])
-    found = steering.nearest(lambda p: bool(np.hypot(*p) <= 1), wanted, np.array([-0.5, 0.0]))
-    assert found is not None
-    assert np.hypot(*found) <= 1
-    assert math.dist(found, wanted) < 4.0 + 0.003
-    assert steering.nearest(lambda p: False, wanted, np.zeros(2)) is None
-
-
-def test_a_foothold_out_of_reach_is_moved_and_said_so(robot: robots.Robot) -> None:
-    start = footsteps.initial_nodes(robot)
-    wanted = Foothold(0, 2.0, 0.1, 0.0)
-    planned = steering.place(robot, (), start, wanted, Steering())
-    x, y, _ = planned.step.end.ankle_positions[0]
-    assert (x, y) == (pytest.approx(0.35, abs=0.01), pytest.approx(0.1, abs=0.02))
-    assert "left foothold was moved by 165 cm" in planned.note
-    assert not footsteps.problems_of(robot, (), planned.step)
-    within = Foothold(0, 0.2, 0.15, 0.1)
-    planned = steering.place(robot, (), start, within, Steering())
-    assert planned.note == ""
-    assert np.allclose(planned.step.end.ankle_positions[0, :2], [0.2, 0.15])
-
-
-def test_a_trunk_handle_gives_the_wishes_that_put_the_trunk_there(robot: robots.Robot) -> None:
-    start = steering.walk(robot, (), footsteps.initial_nodes(robot), 0, Steering(ahead=1, turn=1)).step.end
-    asked = Steering(trunk_ahead=0.03, trunk_aside=-0.02, trunk_height=0.7, trunk_roll=0.05, trunk_pitch=-0.1, trunk_yaw=0.2)
-    end = steering.trunk_step(robot, start, asked).end
-    found = steering.trunk_at(robot, start, end.trunk_position, end.trunk_orientation, Steering())
-    assert np.allclose(found, asked, atol=1e-4)
-
-
-def test_euler_angles_and_back() -> None:
-    angles = (0.3, -0.4, 2.5)
-    orientation = rotations.from_euler(*map(np.float64, angles))
-    assert np.allclose(rotations.to_euler(orientation), angles)
-
-
-# Scripts
-
-
-def test_a_script_written_down_reads_back_the_same(robot: robots.Robot) -> None:
-    for name, path in scripts.ready().items():
-        script = footsteps.load(path, robot)
-        again = footsteps.parse(scripts.text(robot, script.steps, script.boxes), robot, name)
-        assert again.boxes == script.boxes
-        assert footsteps.duration(again) == pytest.approx(footsteps.duration(script))
-        for time in np.arange(0, footsteps.duration(script), 0.13):
-            targets = [footsteps.command_at(each, float(time)).target for each in (script, again)]
-            assert max(np.abs(part).max() for part in nodes.difference(*targets)) < 1e-4
-
-
-def test_every_kind_and_both_courses_lie_ready() -> None:
-    assert {*sampling.KINDS, "obstacles"} <= set(scripts.ready())
-
-
-# Drives with the policy that ships
 
 
 def test_it_needs_no_jax() -> None:

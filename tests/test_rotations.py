@@ -165,3 +165,9 @@ def test_jax_gives_numpys_numbers() -> None:
     for left, right in zip(in_jax, in_numpy, strict=True):
         assert left.dtype == jnp.float32
         assert np.asarray(left) == pytest.approx(np.stack(right), abs=2e-6)
+
+
+def test_euler_angles_and_back() -> None:
+    angles = (0.3, -0.4, 2.5)
+    orientation = rotations.from_euler(*map(np.float64, angles))
+    assert np.allclose(rotations.to_euler(orientation), angles)
