@@ -15,6 +15,7 @@ from bipedtrack import checkpoint, config, footsteps, paths, scripts
 from bipedtrack.control import ControlConfig
 from bipedtrack.rewards import RewardConfig
 from bipedtrack.robot import Robot
+from bipedtrack.run_directory import RunDirectory
 from bipedtrack.sampling import Ranges, Shares
 
 
@@ -230,7 +231,7 @@ def load(name_or_path: str) -> Curriculum:
     return config.load(Curriculum, path)
 
 
-def of_run(run: checkpoint.RunDirectory) -> tuple[Curriculum, int, int]:
+def of_run(run: RunDirectory) -> tuple[Curriculum, int, int]:
     """The curriculum, the seed and the number of devices that a run was started with.
 
     Raises RunError or ConfigError where they are damaged.

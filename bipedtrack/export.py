@@ -12,8 +12,9 @@ from typing import Annotated
 
 import tyro
 
-from bipedtrack import checkpoint, onnx_export, policy, versions
+from bipedtrack import onnx_export, policy, versions
 from bipedtrack.messages import Refusal, fail, quiet_imports
+from bipedtrack.run_directory import RunDirectory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +58,7 @@ def export(run: pathlib.Path, out: pathlib.Path) -> policy.Policy:
     with quiet_imports():
         from bipedtrack import training
 
-    directory = checkpoint.RunDirectory(run)
+    directory = RunDirectory(run)
     newest = training.save_policy(directory, out)
     for warning in directory.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -18,6 +18,7 @@ from bipedtrack import checkpoint, compilation, config, curriculum, distributed,
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.messages import Refusal, fail, quiet_imports
+from bipedtrack.run_directory import RunDirectory
 
 EVALUATION_SEED = 20240  # of the episodes in the table at the end: the same for every policy
 EVALUATION_DIFFICULTY = 0.5
@@ -150,7 +151,7 @@ def run(options: Train, process: Process) -> None:
     devices, description = use_devices(options.device, job.devices, plan.ppo, process)
     job = dataclasses.replace(job, devices=devices)
     with contextlib.ExitStack() as stack:
-        opened: list[checkpoint.RunDirectory] = []
+        opened: list[RunDirectory] = []
 
         def open_directory() -> None:
             opened.append(_directory(options, job, process))
@@ -186,7 +187,7 @@ def _job(options: Train) -> Job:
     if options.resume:
         if options.start is not None:
             raise config.ConfigError("--resume goes on from the run's own checkpoints; leave out --start")
-        with contextlib.closing(checkpoint.RunDirectory.open(_folder(options))) as directory:
+        with contextlib.closing(RunDirectory.open(_folder(options))) as directory:
             plan, seed, devices = curriculum.of_run(directory)
         return Job(config.to_dict(plan), seed, options.devices or devices)
     plan = curriculum.load(options.curriculum)
@@ -201,13 +202,13 @@ def _folder(options: Train) -> pathlib.Path:
     return options.out or pathlib.Path("runs") / f"{pathlib.Path(options.curriculum).stem}-{options.seed}"
 
 
-def _directory(options: Train, job: Job, process: Process) -> checkpoint.RunDirectory:
+def _directory(options: Train, job: Job, process: Process) -> RunDirectory:
     """The run directory, created where the run is a new one."""
     if options.resume:
-        return checkpoint.RunDirectory.open(_folder(options))
+        return RunDirectory.open(_folder(options))
     settings = dataclasses.asdict(job) | {"processes": process.count, "versions": _versions()}
     start = None if options.start is None else _start(options.start, job.plan)
-    return checkpoint.RunDirectory.create(_folder(options), settings, start)
+    return RunDirectory.create(_folder(options), settings, start)
 
 
 def _start(path: pathlib.Path, plan: Curriculum) -> checkpoint.Checkpoint:
@@ -215,7 +216,7 @@ def _start(path: pathlib.Path, plan: Curriculum) -> checkpoint.Checkpoint:
     with quiet_imports():
         from bipedtrack import training
 
-    found = checkpoint.RunDirectory(path).latest() if path.is_dir() else checkpoint.load_checkpoint(path)
+    found = RunDirectory(path).latest() if path.is_dir() else checkpoint.load_checkpoint(path)
     if found is None:
         raise checkpoint.CheckpointError(f"--start {path}: has no checkpoint; wanted one, or a run with a finished PPO call")
     try:
@@ -238,7 +239,7 @@ def _versions() -> dict[str, str | None]:
     return {row.name: row.found for row in versions.check()}
 
 
-def _train(directory: checkpoint.RunDirectory, job: Job, description: str, process: Process) -> None:
+def _train(directory: RunDirectory, job: Job, description: str, process: Process) -> None:
     import rich.console
 
     with quiet_imports():
@@ -278,7 +279,7 @@ def _train(directory: checkpoint.RunDirectory, job: Job, description: str, proce
     console.print(f"policy: {path}", highlight=False, soft_wrap=True)
 
 
-def _show_table(directory: checkpoint.RunDirectory, plan: curriculum.Curriculum, trained: Any, console: Any) -> None:
+def _show_table(directory: RunDirectory, plan: curriculum.Curriculum, trained: Any, console: Any) -> None:
     """Evaluates inverse kinematics alone and the trained policy, prints the table and writes table.json."""
     from bipedtrack import evaluation
 

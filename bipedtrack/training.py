@@ -36,9 +36,10 @@ from bipedtrack import (
     tasks,
     versions,
 )
-from bipedtrack.checkpoint import Checkpoint, CheckpointError, RunDirectory
+from bipedtrack.checkpoint import Checkpoint, CheckpointError
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.progress import Aside, Progress
+from bipedtrack.run_directory import RunDirectory
 
 _UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
 _ACTIVATIONS = {"swish": linen.swish, "tanh": linen.tanh, "relu": linen.relu}

@@ -16,7 +16,7 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 LADDER = """
     messages versions paths record markup drawing
     compilation distributed
-    config checkpoint
+    config checkpoint run_directory
     rotations robot
     nodes kinematics trace packets
     planner terrain sampling feasibility rows

@@ -16,7 +16,8 @@ import onnxruntime
 import pytest
 
 import bipedtrack
-from bipedtrack import checkpoint, config, curriculum, export, observation, policy, robot, training, versions
+from bipedtrack import config, curriculum, export, observation, policy, robot, training, versions
+from bipedtrack.run_directory import RunDirectory
 
 ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
 PLAN = curriculum.load("smoke")
@@ -40,7 +41,7 @@ def make_run(path, finished_calls=2, plan=PLAN):
         "seed": SEED,
         "versions": {row.name: row.found for row in versions.check()},
     }
-    run = checkpoint.RunDirectory.create(path, settings)
+    run = RunDirectory.create(path, settings)
     for index in range(finished_calls):
         run.save_checkpoint(index, random_arrays(plan, index), {"provenance": training.provenance(plan, SEED, index + 1)})
     run.close()
@@ -177,7 +178,7 @@ def test_an_export_replaces_an_older_file(tmp_path):
 
 def test_a_run_that_trains_can_be_exported(tmp_path):
     run = make_run(tmp_path / "run", 1)
-    training_process = checkpoint.RunDirectory.open(run)  # holds the lock
+    training_process = RunDirectory.open(run)  # holds the lock
     export.export(run, tmp_path / "policy.npz")
     training_process.close()
     policy.load(tmp_path / "policy.npz")
@@ -219,7 +220,7 @@ def test_a_damaged_checkpoint(refused, tmp_path, older):
 
 def test_a_checkpoint_of_other_networks(refused, tmp_path):
     run = make_run(tmp_path / "run", 0)
-    with contextlib.closing(checkpoint.RunDirectory.open(run)) as directory:
+    with contextlib.closing(RunDirectory.open(run)) as directory:
         wider = dataclasses.replace(PLAN, network=dataclasses.replace(PLAN.network, actor=(17,)))
         directory.save_checkpoint(0, random_arrays(wider, 0), {"provenance": training.provenance(wider, SEED, 1)})
     line = refused(run, "--out", tmp_path / "policy.npz")

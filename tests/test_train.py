@@ -19,6 +19,7 @@ import pytest
 
 import bipedtrack
 from bipedtrack import checkpoint, policy
+from bipedtrack.run_directory import RunDirectory
 
 ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
 ENVIRONMENT = os.environ | {
@@ -220,7 +221,7 @@ def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(r
         tuned.send_signal(signal.SIGINT)
         status, out, error = finished(tuned)
     assert status == 130 and "begins with" in printed and "stopped; 0 of 3 calls are saved" in out, printed + out + error
-    began, source = checkpoint.RunDirectory(folder / "tuned").latest(), checkpoint.load_checkpoint(first)
+    began, source = RunDirectory(folder / "tuned").latest(), checkpoint.load_checkpoint(first)
     assert began.call == -1 and began.arrays.keys() == source.arrays.keys()
     assert all(np.array_equal(began.arrays[name], source.arrays[name]) for name in source.arrays)
 
@@ -228,7 +229,7 @@ def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(r
     assert (status, error) == (0, ""), out + error
     trained = policy.load(folder / "tuned" / "policy.npz")
     assert trained.provenance["origin"]["steps"] == 576 and trained.provenance["origin"]["seed"] == 3
-    newest = checkpoint.RunDirectory(folder / "tuned").latest()
+    newest = RunDirectory(folder / "tuned").latest()
     assert int(newest.arrays["0/count/lo"]) == 2 * 576  # the normaliser has seen both runs
 
 
