@@ -182,7 +182,9 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 def test_feedback_ratio_0_is_ik(short: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    arguments = ["ik", str(FIRST), "--feedback-ratio", "0", "--script", str(short), "--engine", "mujoco"]
+    # the policy has velocity feedforward, `ik` has none unless told
+    arguments = ["ik", str(FIRST), "--feedback-ratio", "0", "--velocity-feedforward", "True"]
+    arguments += ["--script", str(short), "--engine", "mujoco"]
     found = evaluate.run(tyro.cli(evaluate.Evaluate, args=[*arguments, "--out", str(tmp_path)]))
     ik, ablated = found["tasks"]["short"]["policies"].values()
     for engine in ENGINES[1:]:
@@ -243,7 +245,7 @@ def follow(robot: robots.Robot, found: trace.Trace) -> np.ndarray:
 def test_filter_feedback_ratio_and_feedforward_are_those_asked_for(
     record: Callable[..., trace.Trace], robot: robots.Robot
 ) -> None:
-    found = record(FIRST, "--filter", 1, "--feedback-ratio", 0.1)
+    found = record(FIRST, "--filter", 1, "--feedback-ratio", 0.1, "--velocity-feedforward", False)
     wanted = follow(robot, found) + 0.1 * robot.joint_half_range * found.feedback[0]
     np.testing.assert_allclose(found.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-5)
     assert np.abs(found.feedback).max() > 0.01
