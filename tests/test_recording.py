@@ -266,8 +266,10 @@ def test_recording_in_c_is_the_products_controller_in_a_loop(
         feedbacks.append(controller.last_feedback)
         data.ctrl[:] = targets[-1]
         mujoco.mj_step(model, data)
-    for found, wanted in ((in_c.trace.qpos, states), (in_c.trace.joint_targets, targets), (in_c.trace.feedback, feedbacks)):
-        np.testing.assert_allclose(found[index, :60], wanted[:60], atol=1e-5)
+    # velocity feedforward multiplies the rounding of joint angles by (kd/kp) / 0.005 s = 10; measured: 1.2e-5
+    for found, wanted in ((in_c.trace.joint_targets, targets), (in_c.trace.feedback, feedbacks)):
+        np.testing.assert_allclose(found[index, :60], wanted[:60], atol=5e-5)
+    np.testing.assert_allclose(in_c.trace.qpos[index, :60], states[:60], atol=1e-5)
     # measured: 2e-7; the robot on stairs meanwhile walks on boxes that have moved
     np.testing.assert_allclose(in_c.trace.qpos[index], states, atol=1e-3)
     assert np.ptp(feedbacks, axis=0).max() > 0.05
