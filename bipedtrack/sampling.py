@@ -21,11 +21,7 @@ class Ranges(NamedTuple):
     """Table II as ranges: (lowest, mildest, highest) at full difficulty; at difficulty 0 all is mildest."""
 
     period: tuple[float, float, float] = (0.4, 0.55, 0.7)  # s, of a task step with a swing foot
-    walk_step: tuple[float, float, float] = (
-        -0.15,
-        0.0,
-        0.25,
-    )  # m the trunk advances per task step; a foot travels twice that
+    walk_step: tuple[float, float, float] = (-0.15, 0.0, 0.25)  # m the trunk advances; a foot travels twice that
     sidle_step: tuple[float, float, float] = (-0.12, 0.0, 0.12)  # m to the left per task step
     turn_yaw: tuple[float, float, float] = (-0.35, 0.0, 0.35)  # rad per task step
     turn_radius: tuple[float, float, float] = (0.0, 0.2, 0.6)  # m
@@ -39,11 +35,7 @@ class Ranges(NamedTuple):
     curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
     trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
     swing_ease: tuple[float, float, float] = (0.2, 0.25, 0.3)  # planner.TaskStep.ease; 0: the paper's uniform curves
-    posture_x: tuple[float, float, float] = (
-        -0.05,
-        0.0,
-        0.05,
-    )  # m, centre of mass ahead of the feet's middle (stand, squat; else 0)
+    posture_x: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # m, centre of mass before the feet's middle (stand, squat)
     posture_y: tuple[float, float, float] = (-0.04, 0.0, 0.04)  # m, to the left of it
     posture_height: tuple[float, float, float] = (0.60, 0.75, 0.79)  # m
     posture_roll: tuple[float, float, float] = (-0.15, 0.0, 0.15)  # rad
@@ -93,7 +85,7 @@ class Distribution(NamedTuple):
     hold_share: Array  # () share of the episodes that stop and hold
     hold_after: Array  # (2,) least and greatest number of task steps before the hold
     down_share: Array  # () share of the stairs that go down
-    mix_share: Array  # () share of the episodes on level ground that change their kind every MIX_STEPS task steps
+    mix_share: Array  # () share of the episodes on level ground that change their kind every `tasks.MIX_STEPS` task steps
     break_share: Array  # () share of the episodes that stop in stride, or bring the feet together, every few task steps
     push_share: Array  # () share of the episodes with pushes
     ranges: dict[str, Array]  # by the names of Ranges, (2,) each: lowest and highest at this difficulty
