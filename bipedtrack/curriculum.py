@@ -111,6 +111,7 @@ class Stage:
     scripts: tuple[str, ...] = ()  # footstep scripts that episodes follow too: names in curricula/footsteps, or files
     script_share: float = 0.0  # share of the episodes that follow one of them
     rewards: RewardConfig | None = None  # where they are others than the curriculum's
+    ranges: Ranges | None = None  # the same; evaluations keep to the curriculum's
 
     def __post_init__(self) -> None:
         if not self.lessons:

@@ -260,3 +260,13 @@ def test_provenance_tells_what_a_run_began_with_to_its_last_call() -> None:
     assert begun is not None and begun["steps"] == 576 and len(begun["parameters"]) == 64
     later = checkpoint.Checkpoint(0, arrays, {"provenance": training.provenance(config, 8, 1, begun)})
     assert training.origin_of(later) == begun
+
+
+def test_a_stage_with_ranges_of_its_own_draws_from_them() -> None:
+    config = plan()
+    own = config.ranges._replace(stair_riser=(0.1, 0.1, 0.17))
+    stages = [dataclasses.replace(config.stages[1], ranges=ranges) for ranges in (None, own)]
+    lesson = dataclasses.replace(config.stages[1].lessons[0], difficulty=1.0)
+    drawn = [training.make_env(config, stage, lesson).given.ranges for stage in stages]
+    assert [ranges["stair_riser"].tolist() for ranges in drawn] == [pytest.approx([0.02, 0.17]), pytest.approx([0.1, 0.17])]
+    assert drawn[0]["stair_tread"].tolist() == drawn[1]["stair_tread"].tolist()
