@@ -8,7 +8,7 @@ import pytest
 from bipedtrack import control, observation, rewards, robot, rollout, sampling
 from bipedtrack.env import EnvConfig, TrackingEnv
 
-QUICK_COMPILE = {"xla_backend_optimization_level": 0}  # these programs run once
+pytestmark = pytest.mark.usefixtures("unoptimised")
 KINDS = ("stand", "walk", "stand", "turn", "sidle", "stand")
 PERIOD, SECONDS, SEED = 0.02, 1.1, 5  # 55 policy steps: more than one chunk of a rollout, and not whole chunks
 ANKLE_PITCH = np.eye(12)[4] + np.eye(12)[10]
@@ -29,7 +29,7 @@ def batch() -> sampling.Distribution:
 
 
 @pytest.fixture(scope="module")
-def env() -> TrackingEnv:
+def env(unoptimised: None) -> TrackingEnv:
     given = jax.tree.map(lambda leaf: leaf[0], batch())
     return TrackingEnv(
         robot.load(), EnvConfig(rewards.RewardConfig(), control.ControlConfig(level_feet=True), PERIOD), given
@@ -44,8 +44,8 @@ def outcome(env: TrackingEnv) -> rollout.Outcome:
 @pytest.fixture(scope="module")
 def by_loop(env: TrackingEnv) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Whether a robot has fallen at each step, and its errors by name, (steps, robots) each."""
-    step = jax.jit(jax.vmap(env.step), compiler_options=QUICK_COMPILE)
-    begin = jax.jit(jax.vmap(env.begin), compiler_options=QUICK_COMPILE)
+    step = jax.jit(jax.vmap(env.step))
+    begin = jax.jit(jax.vmap(env.begin))
     states = [begin(jax.random.split(jax.random.PRNGKey(SEED), len(KINDS)), batch())]
     for _ in range(55):
         states.append(step(states[-1], jnp.stack([act(one) for one in states[-1].obs])))
