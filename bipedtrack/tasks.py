@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from bipedtrack import kinematics, nodes, planner, rotations, terrain
+from bipedtrack.footholds import FOOT_DISTANCE
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import Robot
@@ -23,7 +24,6 @@ from bipedtrack.sampling import SIDLE, SQUAT, STAIRS, WALK, WANDER, Distribution
 
 MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
 ERRORS = ("ankle_error_cm", "ankle_yaw_error_deg", "trunk_error_cm", "trunk_error_deg")  # of `tracking_errors`
-FOOT_DISTANCE = 0.2  # m between the ankles when the feet stand side by side
 _BREAKS = (2.0, 7.0)  # task steps from one break to the next, and one more than the most
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
 

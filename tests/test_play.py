@@ -306,6 +306,25 @@ def test_a_push_moves_it(tab: Tab, page: Page) -> None:
     wait_until(lambda: max(pushed(), default=0.0) > before[1] + 1.0)
 
 
+@browser_tests
+def test_another_policy_takes_over_while_it_walks(tab: Tab, page: Page) -> None:
+    first = page.clock.ask(lambda drive: drive.controller.policy)
+    tab.click("Watch")
+    page._steer(ahead=1.0)
+    wait_until(lambda: x_of(page) > 0.3)
+    for choice, other in (("best", "versatile"), ("versatile", "best")):
+        before = page.clock.ask(lambda drive: drive.controller.policy)
+        tab.click(choice)
+        tab.click(other)
+        wait_until(lambda before=before: page.clock.ask(lambda drive: drive.controller.policy) is not before)
+        at = x_of(page)
+        wait_until(lambda at=at: x_of(page) > at + 0.3)
+        assert page.clock.view.mode is Mode.STEER
+    again = page.clock.ask(lambda drive: drive.controller.policy)
+    assert again.provenance == first.provenance
+    tab.click("Drive")
+
+
 def is_red(picture: bytes, x: float, y: float) -> bool:
     """Whether the pixel there has the colour of what is out of reach."""
     red, green, blue = Image.open(io.BytesIO(picture)).convert("RGB").getpixel((round(x), round(y)))
@@ -372,6 +391,27 @@ def test_a_foothold_dragged_out_of_reach_turns_red_and_is_moved(wide: Tab, page:
     assert 0.2 < math.dist((x, y), (0.0, 0.1)) < 0.36  # as far as steps go, and to that side
     assert y > 0.3
     assert page.clock.view.mode is Mode.STEER
+
+
+@browser_tests
+def test_planned_footprints_are_seen_ahead_of_the_robot(wide: Tab, page: Page) -> None:
+    feet = ((0.3, 0.15), (0.3, -0.15))
+    lines = [f"{leg},{x},{y}" for leg, (x, y) in zip(("left", "right"), feet, strict=True)]
+    script = footsteps.parse("\n".join([",".join(footsteps.COLUMNS), "both", *lines]), robots.load(), "here")
+
+    def seen() -> list[bool]:
+        """For each foothold, whether it has the hue of its foot's print: blue or orange."""
+        picture = Image.open(io.BytesIO(wide.picture())).convert("RGB")
+        places = pixels(page, np.array([[x, y, 0.0] for x, y in feet]))
+        left, right = (picture.getpixel((round(x), round(y))) for x, y in places)
+        return [left[2] > 1.5 * left[0], right[0] > 1.5 * right[2]]
+
+    assert not any(seen())
+    page.clock.ask(lambda drive: drive.run(script))
+    page._toggle_pause()
+    wait_until(lambda: all(seen()))
+    assert len(page.clock.view.prints) == 2
+    page._toggle_pause()
 
 
 @browser_tests

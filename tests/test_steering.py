@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bipedtrack import footholds, footsteps, kinematics, rotations, sampling, steering, tasks
+from bipedtrack import footsteps, kinematics, rotations, sampling, steering
 from bipedtrack import robot as robots
 from bipedtrack.footholds import Foothold
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
@@ -60,7 +60,6 @@ def test_limits_are_those_of_training() -> None:
         low, _, high = getattr(ranges, theirs)
         assert steering.LIMITS[mine][1] == high
         assert steering.LIMITS[mine][0] >= low
-    assert footholds.FOOT_DISTANCE == tasks.FOOT_DISTANCE
 
 
 def test_wishes_are_clamped_and_nonsense_becomes_the_default() -> None:
