@@ -20,7 +20,7 @@ LADDER = """
     rotations robot
     nodes kinematics trace packets
     planner terrain sampling feasibility rows
-    tasks footsteps footholds scripts steering plans disturbances control observation rewards swings metrics verdicts charts
+    footsteps footholds tasks scripts steering plans disturbances control observation rewards swings metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite pictures
     training evaluation sheets comparisons report
