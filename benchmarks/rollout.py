@@ -101,7 +101,7 @@ def environment(the_env: TrackingEnv, driven: policy.Policy | None, robots: int,
     def step(state: Any, _: None) -> tuple[Any, None]:
         if driven is None:
             return wrapped.step(state, jnp.zeros((len(state.obs), 12))), None
-        return wrapped.step(state, policy.apply(driven.network, driven.activation, state.obs)), None
+        return wrapped.step(state, driven.output(state.obs)), None
 
     made, compiling = measure.compiled(lambda state: jax.lax.scan(step, state, length=length)[0], state)
     for _ in range(max(1, round(_WARM_UP / (length * the_env.config.policy_period)))):

@@ -28,6 +28,7 @@ class NetworkConfig:
     activation: Literal["swish", "tanh", "relu"] = "swish"
     initial_noise: float = 0.7  # standard deviation of the Gaussian over the network's output
     normalizer_floor: float = 0.05  # added to the variance of every observation, which may be constant at first
+    symmetric: bool = False  # shown the mirror image where the right foot leads: half as much to learn (`symmetry`)
 
     def __post_init__(self) -> None:
         if min(self.actor, default=0) < 1 or min(self.critic, default=0) < 1:

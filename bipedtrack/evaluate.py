@@ -64,27 +64,25 @@ class Subject:
     robot: robot.Robot
     settings: control.ControlConfig
     policy_period: float  # s
-    network: policy.Network | None  # None: no feedback
-    activation: str
+    actor: policy.Policy | None  # None: no feedback
     feedforward: bool
     provenance: dict[str, Any]
 
     def act(self, observation: Any) -> Any:
         """The network's output, (12,), for an observation, (101,)."""
-        if self.network is None:
+        if self.actor is None:
             return 0 * observation[:12]
-        return policy.apply(self.network, self.activation, observation)
+        return self.actor.output(observation)
 
 
 def subject(name: str, options: Evaluate) -> Subject:
     """What a policy argument names, with the options' ablations. Raises in one line where there is no such policy."""
     if name in ("ik", "zero"):
         the_robot, settings, period = robot.load(), control.ControlConfig(level_feet=True), 0.02
-        network, activation, provenance = None, "swish", {}
+        actor, provenance = None, {}
     else:
-        loaded = policy.load(name, robot.load())
-        the_robot, settings, period = loaded.robot, loaded.settings, loaded.policy_period
-        network, activation, provenance = loaded.network, loaded.activation, loaded.provenance
+        actor = policy.load(name, robot.load())
+        the_robot, settings, period, provenance = actor.robot, actor.settings, actor.policy_period, actor.provenance
     if options.filter is not None:
         settings = dataclasses.replace(settings, filter=options.filter)
     if options.velocity_feedforward is not None:
@@ -93,7 +91,7 @@ def subject(name: str, options: Evaluate) -> Subject:
         ratio = np.full_like(the_robot.feedback_ratio, options.feedback_ratio)
         the_robot = dataclasses.replace(the_robot, feedback_ratio=ratio)
     feedforward = options.feedforward and name != "zero"
-    return Subject(name, the_robot, settings, period, network, activation, feedforward, provenance)
+    return Subject(name, the_robot, settings, period, actor, feedforward, provenance)
 
 
 class Engines:

@@ -53,7 +53,7 @@ def by_kind(
     def act(observation: Any) -> Any:
         if trained is None:
             return jnp.zeros(the_env.action_size)
-        return policy.apply(trained.network, trained.activation, observation)
+        return trained.output(observation)
 
     result = rollout.outcomes(the_env, act, batch, config.episode_seconds, seed)
     rows = []

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bipedtrack import __version__, checkpoint, config, observation
+from bipedtrack import __version__, checkpoint, config, observation, symmetry
 from bipedtrack.messages import Refusal
 from bipedtrack.policy import Policy
 
@@ -48,8 +48,28 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
         nodes.append(helper.make_node(operator, inputs, [output], name=output))
         return output
 
-    network = policy.network
-    hidden = apply("Sub", "observation", constant("normalizer/mean", network.mean))
+    def difference(of: str, left: int, right: int) -> str:
+        """The second of two numbers of a part of the observation less the first, (N, 1)."""
+        column = np.zeros((observation.SIZE, 1))
+        start = observation.layout()[of].start
+        column[start + left], column[start + right] = -1, 1
+        return apply("MatMul", "observation", constant(f"difference/{of}", column))
+
+    def right_leads() -> str:
+        """symmetry.right_leads."""
+        zero, later = constant("zero", 0.0), difference("timer", 0, 1)
+        ahead = apply("Less", difference("feedforward", 2, 8), constant("ahead", -symmetry.AHEAD))
+        return apply("Or", apply("Greater", later, zero), apply("And", apply("Equal", later, zero), ahead))
+
+    def where_right(mirrored: str, otherwise: str, output: str = "") -> str:
+        return apply("Where", right, mirrored, otherwise, output=output)
+
+    network, shown, right = policy.network, "observation", ""
+    if policy.symmetric:
+        image = constant("mirror", symmetry.mirrored_observation(np.eye(observation.SIZE)))
+        right = right_leads()
+        shown = where_right(apply("MatMul", shown, image), shown)
+    hidden = apply("Sub", shown, constant("normalizer/mean", network.mean))
     hidden = apply("Div", hidden, constant("normalizer/std", network.std))
     for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         if i > 0 and policy.activation == "swish":
@@ -58,7 +78,10 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
             hidden = apply({"tanh": "Tanh", "relu": "Relu"}[policy.activation], hidden)
         hidden = apply("Gemm", hidden, constant(f"actor/{i}/weight", weight), constant(f"actor/{i}/bias", bias))
     hidden = apply("Mul", hidden, constant("feedback_scale", policy.settings.feedback_scale))
-    apply("Clip", hidden, constant("low", -1.0), constant("high", 1.0), output="feedback")
+    clipped = apply("Clip", hidden, constant("low", -1.0), constant("high", 1.0), output="" if right else "feedback")
+    if right:
+        image = constant("mirror_joints", symmetry.mirrored_joints(np.eye(len(policy.robot.joint_names))))
+        where_right(apply("MatMul", clipped, image), clipped, output="feedback")
 
     def batch(name: str, width: int, doc: str) -> onnx.ValueInfoProto:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", width], doc)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bipedtrack import checkpoint, config, control, kinematics, observation
+from bipedtrack import checkpoint, config, control, kinematics, observation, symmetry
 from bipedtrack.control import ControlConfig
 from bipedtrack.messages import Refusal
 from bipedtrack.planner import Command
@@ -64,10 +64,18 @@ class Policy:
     policy_period: float  # s
     robot: Robot
     provenance: dict[str, Any]  # where it comes from: curriculum, seed, steps, versions
+    symmetric: bool = False  # the network is shown the mirror image where the right foot leads (`symmetry`)
+
+    def output(self, flat_observation: Array) -> Array:
+        """The mean of the action distribution (..., 12) for observations (..., 101)."""
+        if not self.symmetric:
+            return apply(self.network, self.activation, flat_observation)
+        shown, right = symmetry.canonical(flat_observation)
+        return symmetry.restored(apply(self.network, self.activation, shown), right)
 
     def feedback(self, flat_observation: Array) -> Array:
         """a_fb (..., 12) in [-1, 1] for observations (..., 101), without exploration noise."""
-        output = apply(self.network, self.activation, flat_observation)
+        output = self.output(flat_observation)
         return namespace(output).clip(self.settings.feedback_scale * output, -1.0, 1.0)
 
 
@@ -83,6 +91,7 @@ def save(policy: Policy, path: str | pathlib.Path) -> None:
         "activation": policy.activation,
         "control": config.to_dict(policy.settings),
         "policy_period": policy.policy_period,
+        "symmetric": policy.symmetric,
         "robot": {k: v for k, v in robot_fields.items() if not isinstance(v, np.ndarray)},
         "provenance": policy.provenance,
     }
@@ -140,6 +149,7 @@ def _assembled(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Policy:
         policy_period=float(meta["policy_period"]),
         robot=Robot(**robot_meta),
         provenance=meta["provenance"],
+        symmetric=meta.get("symmetric", False),  # files from before there was a choice
     )
 
 
@@ -176,6 +186,10 @@ def _check(policy: Policy) -> None:
         raise PolicyError(f"the network gives {sizes[-1]} numbers; wanted one for each of {len(robot.joint_names)} joints")
     if policy.activation not in ACTIVATIONS:
         raise PolicyError(f"activation {policy.activation!r} is unknown; wanted one of {', '.join(ACTIVATIONS)}")
+    if not isinstance(policy.symmetric, bool):
+        raise PolicyError(f"symmetric must be true or false, not {policy.symmetric!r}")
+    if policy.symmetric and not symmetry.is_symmetric(robot):
+        raise PolicyError("the policy is symmetric, but its robot is not its own mirror image")
     if not (network.std > 0).all():
         raise PolicyError("the normaliser's standard deviations must be positive")
     for name in ("thigh", "shank", "ankle_height", "timestep"):

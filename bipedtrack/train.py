@@ -14,7 +14,7 @@ from typing import Any, Literal, NoReturn
 
 import tyro
 
-from bipedtrack import checkpoint, compilation, config, curriculum, distributed, robot, versions
+from bipedtrack import checkpoint, compilation, config, curriculum, distributed, robot, symmetry, versions
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.messages import Refusal, fail, quiet_imports
@@ -193,6 +193,8 @@ def _job(options: Train) -> Job:
     plan = curriculum.load(options.curriculum)
     the_robot = robot.load(plan.robot)
     plan.substeps(the_robot.timestep)
+    if plan.network.symmetric and not symmetry.is_symmetric(the_robot):
+        raise config.ConfigError(f"network.symmetric: robot {plan.robot!r} is not its own mirror image; wanted false")
     for stage in plan.stages:  # rather than in the last hour
         curriculum.scripts_of(stage, the_robot)
     return Job(config.to_dict(plan), options.seed, options.devices)

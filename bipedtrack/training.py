@@ -7,6 +7,7 @@ bitwise the same parameters on the same machine; what a call costs to repeat is 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import math
 import pathlib
@@ -16,6 +17,7 @@ from typing import Any
 
 import brax.envs
 import jax
+import jax.numpy as jnp
 import numpy as np
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses, networks
@@ -33,6 +35,7 @@ from bipedtrack import (
     policy,
     robot,
     sampling,
+    symmetry,
     tasks,
     versions,
 )
@@ -267,7 +270,7 @@ def _loss_and_episodes(compute_loss: Callable[..., Any]) -> Callable[..., Any]:
 
 def make_networks(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> networks.PPONetworks:
     """Brax's actor and critic, as a `network_factory`: Gaussian actions whose deviation is learned, not squashed."""
-    return networks.make_ppo_networks(
+    made = networks.make_ppo_networks(
         *args,
         **kwargs,
         policy_hidden_layer_sizes=network.actor,
@@ -276,6 +279,25 @@ def make_networks(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) 
         distribution_type="normal",
         noise_std_type="log",
         init_noise_std=network.initial_noise,
+    )
+    return _symmetric(made) if network.symmetric else made
+
+
+def _symmetric(made: networks.PPONetworks) -> networks.PPONetworks:
+    """The networks shown the mirror image where the right foot leads, their actions mirrored back."""
+
+    def act(normalizer: Any, params: Any, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        shown, right = symmetry.canonical(flat)
+        mean, deviation = made.policy_network.apply(normalizer, params, shown)
+        return symmetry.restored(mean, right), jnp.where(right, symmetry.swapped(deviation), deviation)
+
+    def value(normalizer: Any, params: Any, flat: jax.Array) -> jax.Array:
+        return made.value_network.apply(normalizer, params, symmetry.canonical(flat)[0])
+
+    return dataclasses.replace(
+        made,
+        policy_network=dataclasses.replace(made.policy_network, apply=act),
+        value_network=dataclasses.replace(made.value_network, apply=value),
     )
 
 
@@ -358,6 +380,7 @@ def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], prov
         policy_period=config.policy_period,
         robot=robot.load(config.robot),
         provenance=provenance,
+        symmetric=config.network.symmetric,
     )
 
 

@@ -20,7 +20,8 @@ LADDER = """
     rotations robot
     nodes kinematics trace packets
     planner terrain sampling feasibility rows
-    footsteps footholds tasks scripts steering plans disturbances control observation rewards swings metrics verdicts charts
+    footsteps footholds tasks scripts steering plans disturbances
+    control observation symmetry rewards swings metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum rollout progress recording suite pictures
     training evaluation sheets comparisons report
@@ -29,8 +30,8 @@ LADDER = """
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
 DEPLOYMENT = (
-    "rotations nodes kinematics planner terrain feasibility rows footsteps control observation policy packets follower"
-    " robot config checkpoint"
+    "rotations nodes kinematics planner terrain feasibility rows footsteps control observation symmetry policy"
+    " packets follower robot config checkpoint"
 ).split()
 ABSENT = ("jax", "flax", "brax", "optax", "mujoco")
 
