@@ -1,5 +1,7 @@
 """Policies for tests to play with: random networks of any size on the robot of Table I."""
 
+import dataclasses
+
 import numpy as np
 
 from bipedtrack import observation, robot
@@ -30,4 +32,5 @@ def make_policy(network, policy_period=0.02, settings=None):
 
 def small_policy():
     """A policy whose every number differs from the defaults."""
-    return make_policy(random_network(2, (8, 6)), settings=ControlConfig(filter=0.3, velocity_feedforward=True))
+    made = make_policy(random_network(2, (8, 6)), settings=ControlConfig(filter=0.3, velocity_feedforward=True))
+    return dataclasses.replace(made, symmetric=True)

@@ -1,5 +1,6 @@
 """The ONNX graph against the numpy policy, and what travels with it."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import onnx
 import onnxruntime
 import pytest
 
-from bipedtrack import checkpoint, observation, onnx_export
+from bipedtrack import checkpoint, observation, onnx_export, symmetry
 from bipedtrack import policy as policies
 from bipedtrack.control import ControlConfig
 from bipedtrack.robot import Robot
@@ -48,6 +49,17 @@ def run(model: onnx.ModelProto, batch: np.ndarray) -> np.ndarray:
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     (feedback,) = session.run(["feedback"], {"observation": batch})
     return feedback
+
+
+def test_a_symmetric_policys_graph_looks_at_the_mirror_image_where_the_policy_does(robot: Robot) -> None:
+    policy = dataclasses.replace(random_policy(robot), symmetric=True)
+    batch = observations(policy.network)
+    batch[::3, observation.layout()["timer"]] = 0.0  # both feet stand
+    right = symmetry.right_leads(batch)[:, 0]
+    assert all(0.05 < part.mean() < 0.95 for part in (right[::3], right[1::3]))
+    feedback = run(onnx_export.to_onnx(policy), batch)
+    np.testing.assert_allclose(feedback, policy.feedback(batch), atol=1e-5)
+    assert np.abs(feedback - random_policy(robot).feedback(batch)).max() > 0.1
 
 
 @pytest.mark.parametrize("activation", policies.ACTIVATIONS)

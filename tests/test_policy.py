@@ -54,16 +54,16 @@ def test_the_network_in_numpy_equals_the_network_in_jax(activation):
     np.testing.assert_allclose(policy.apply(network, activation, OBSERVATIONS[7]), found[7], atol=1e-5)
 
 
-@pytest.mark.parametrize("activation", policy.ACTIVATIONS)
-def test_the_exported_network_equals_braxs_own(activation):
-    network = curriculum.NetworkConfig(actor=(64, 48), critic=(8,), activation=activation)
+@pytest.mark.parametrize(("activation", "symmetric"), [*((name, False) for name in policy.ACTIVATIONS), ("swish", True)])
+def test_the_exported_network_equals_braxs_own(activation, symmetric):
+    network = curriculum.NetworkConfig(actor=(64, 48), critic=(8,), activation=activation, symmetric=symmetric)
     plan = dataclasses.replace(curriculum.load("smoke"), network=network)
     made = training.make_networks(network, observation.SIZE, JOINTS, preprocess_observations_fn=running_statistics.normalize)
     params = random_parameters(made, network)
     act = networks.make_inference_fn(made)(params, deterministic=True)
     wanted = np.asarray(jax.jit(act)(OBSERVATIONS, jax.random.PRNGKey(0))[0])
     exported = training.to_policy(plan, training.to_arrays(params), {})
-    assert_close(policy.apply(exported.network, exported.activation, OBSERVATIONS), wanted)
+    assert_close(exported.output(OBSERVATIONS), wanted)
     # as the environment takes brax's actions
     scale = plan.control.feedback_scale
     feedback = exported.feedback(OBSERVATIONS)
@@ -129,7 +129,7 @@ def test_a_policy_comes_back_from_its_file_bit_for_bit(original, content, scratc
     for name, wanted in vars(ROBOT).items():
         found = getattr(loaded.robot, name)
         assert type(found) is type(wanted) and np.array_equal(found, wanted)
-    for name in ("activation", "settings", "policy_period", "provenance"):
+    for name in ("activation", "settings", "policy_period", "provenance", "symmetric"):
         assert getattr(loaded, name) == getattr(original, name)
     policy.save(loaded, scratch)
     assert scratch.read_bytes() == content
@@ -253,6 +253,8 @@ FORGERIES = {
     "weight double": (change("actor/0/weight", np.float64), "finite float32"),
     "bias half": (change("actor/2/bias", np.float16), "finite float32"),
     "mean integer": (change("normalizer/mean", lambda m: m.astype(np.int32)), "finite float32"),
+    "symmetric by a word": (put("yes", "symmetric"), "symmetric must be true or false, not 'yes'"),
+    "symmetric on unequal legs": (change("robot/kp", poke(123.0)), "its robot is not its own mirror image"),
     "unknown activation": (put("gelu", "activation"), "activation 'gelu' is unknown; wanted one of swish, tanh, relu"),
     "no activation": (lambda arrays, meta: meta.pop("activation"), "activation"),
     "unknown control": (put(1.0, "control", "fliter"), "did you mean 'filter'"),
