@@ -57,9 +57,10 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
 
     def right_leads() -> str:
         """symmetry.right_leads."""
-        zero, later = constant("zero", 0.0), difference("timer", 0, 1)
+        later, earlier = difference("timer", 0, 1), constant("earlier", -symmetry.LATER)
         ahead = apply("Less", difference("feedforward", 2, 8), constant("ahead", -symmetry.AHEAD))
-        return apply("Or", apply("Greater", later, zero), apply("And", apply("Equal", later, zero), ahead))
+        both = apply("And", apply("GreaterOrEqual", later, earlier), ahead)
+        return apply("Or", apply("Greater", later, constant("later", symmetry.LATER)), both)
 
     def where_right(mirrored: str, otherwise: str, output: str = "") -> str:
         return apply("Where", right, mirrored, otherwise, output=output)

@@ -27,7 +27,8 @@ _SIGNS = Observation(
 _BY_LEG = {"timer", "joint_positions", "joint_velocities", "feedforward", "last_feedback"} | {
     name for name in Observation._fields if "ankle" in name
 }
-AHEAD = 0.02  # of half a hip pitch's range: a foot is ahead of the other one by more than rounding
+# by how much more than rounding the right foot must lead: s later on the ground, and half ranges of hip pitch
+LATER, AHEAD = 1e-6, 0.02
 
 
 def _order() -> list[int]:
@@ -68,7 +69,8 @@ def right_leads(flat: Array) -> Array:
     left_time, right_time = flat[..., _TIMER][..., :1], flat[..., _TIMER][..., 1:]
     left_hip, right_hip = flat[..., _FEEDFORWARD][..., 2:3], flat[..., _FEEDFORWARD][..., 8:9]
     behind = right_hip - left_hip  # a hip pitches forward by less, or the other way, the farther its foot is ahead
-    return (right_time > left_time) | ((right_time == left_time) & (behind < -AHEAD))
+    later = right_time - left_time
+    return (later > LATER) | ((later >= -LATER) & (behind < -AHEAD))
 
 
 def canonical(flat: Array) -> tuple[Array, Array]:
