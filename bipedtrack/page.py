@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import pathlib
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import viser
@@ -17,6 +18,8 @@ from bipedtrack.drive import Drive, Mode, View
 from bipedtrack.realtime import VIEW_SECONDS, RealTime, Sample
 from bipedtrack.scene import Scene
 from bipedtrack.steering import LIMITS, Steering
+
+T = TypeVar("T")
 
 _SLIDERS = {
     "step_length": ("step length, m", 0.01),
@@ -44,6 +47,19 @@ W A S D, the arrows and the mouse move the camera.
 
 **Drag** the arrows and the square at a foot to place it, those at the trunk to move it: red is out of reach.
 """
+
+
+def in_loop(server: viser.ViserServer, change: Callable[[], T]) -> T:
+    """What `change` returns, called in the thread of the server's event loop; not to be asked for from there.
+
+    All that sends something to viewers belongs there: viser tells its writers by an asyncio event, which is for one thread
+    alone. Set from another one it may be lost, and that viewer's page stands still for good.
+    """
+
+    async def run() -> T:
+        return change()
+
+    return asyncio.run_coroutine_threadsafe(run(), server.get_event_loop()).result()
 
 
 class Page:
@@ -82,17 +98,19 @@ class Page:
         """Draws until `stop`, 30 times a second, the plots and texts 5 times, while somebody looks on."""
         beat = 0
         while not self._stopped.wait(VIEW_SECONDS):
-            if not self._server.get_clients():
-                continue
-            view = self.clock.view
-            with self._server.atomic():
-                self.scene.show(view, self._follow.value)
-            if beat % 3 == 0:
-                self.scene.show_traces()
-            if beat % 6 == 0:
-                self._show_text(view)
-                self._show_plots()
-            beat += 1
+            if self._server.get_clients():
+                in_loop(self._server, functools.partial(self._draw, beat))
+                beat += 1
+
+    def _draw(self, beat: int) -> None:
+        view = self.clock.view
+        with self._server.atomic():
+            self.scene.show(view, self._follow.value)
+        if beat % 3 == 0:
+            self.scene.show_traces()
+        if beat % 6 == 0:
+            self._show_text(view)
+            self._show_plots()
 
     def stop(self) -> None:
         """Ends `run`."""
@@ -110,10 +128,14 @@ class Page:
 
     def _say(self, words: str, wrong: bool = False) -> None:
         """A sentence in every viewer's corner."""
+        title, color = ("not done", "red") if wrong else ("done", None)
         for client in self._server.get_clients().values():
-            client.add_notification(
-                "not done" if wrong else "done", words, color="red" if wrong else None, auto_close_seconds=10
-            )
+            tell = functools.partial(client.add_notification, title, words, color=color, auto_close_seconds=10)
+            in_loop(self._server, tell)
+
+    def _set(self, handle: Any, name: str, value: Any) -> None:
+        """A new value for an element of the page."""
+        in_loop(self._server, lambda: setattr(handle, name, value))
 
     def _steer(self, **wishes: float) -> None:
         self._ask(lambda drive: drive.steer(**wishes))
@@ -186,18 +208,18 @@ class Page:
 
         @chosen.on_update
         def _(event: Any) -> None:
-            self._text.value = ready[event.target.value].read_text(encoding="utf-8")
+            self._set(self._text, "value", ready[event.target.value].read_text(encoding="utf-8"))
 
         @upload.on_upload
         def _(event: Any) -> None:
-            self._text.value = event.target.value.content.decode("utf-8", errors="replace")
+            self._set(self._text, "value", event.target.value.content.decode("utf-8", errors="replace"))
 
     def _run_script(self) -> None:
-        self._problems.content = ""
+        self._set(self._problems, "content", "")
         try:
             script = footsteps.parse(self._text.value, self._robot, "script")
         except footsteps.ScriptError as error:
-            self._problems.content = "\n".join(f"- {line}" for line in str(error).splitlines())
+            self._set(self._problems, "content", "\n".join(f"- {line}" for line in str(error).splitlines()))
             return
         self._ask(lambda drive: drive.run(script, self._loop.value))
 
@@ -205,12 +227,13 @@ class Page:
         """The drive's text into the editor."""
         written = self._ask(Drive.as_script)
         if written is not None:
-            self._text.value = written
+            self._set(self._text, "value", written)
 
     def _save(self, event: Any) -> None:
         """The editor's text as a file, to the one who asked."""
         if event.client is not None:
-            event.client.send_file_download("script.csv", self._text.value.encode(), save_immediately=True)
+            send = functools.partial(event.client.send_file_download, "script.csv", self._text.value.encode())
+            in_loop(self._server, functools.partial(send, save_immediately=True))
 
     def _add_watching(self) -> None:
         """Plots, push, time, policy."""
@@ -247,10 +270,11 @@ class Page:
         self._ask(lambda drive: drive.push(impulse, direction))
 
     def _toggle_pause(self) -> None:
-        self._pause.value = self.clock.paused = not self.clock.paused
+        self.clock.paused = not self.clock.paused
+        self._set(self._pause, "value", self.clock.paused)
 
     def _single_step(self) -> None:
-        self._pause.value = True
+        self._set(self._pause, "value", True)
         self.clock.single_step()
 
     def _use(self, name: str) -> None:
@@ -292,7 +316,8 @@ class Page:
             finally:
                 self.scene.held.discard(handle)
         elif handle in self.scene.held:
-            self.scene.mark(handle, reaches())
+            within_reach = reaches()
+            in_loop(self._server, lambda: self.scene.mark(handle, within_reach))
 
     # What is within reach is searched in the viewer's own thread, for it takes long: the drive goes on meanwhile.
 

@@ -82,7 +82,7 @@ def serve(options: Play) -> Iterator[Page]:
 
     from bipedtrack import policy, robot
     from bipedtrack.drive import Drive
-    from bipedtrack.page import Page
+    from bipedtrack.page import Page, in_loop
     from bipedtrack.realtime import RealTime
 
     require_free(options.host, options.port)
@@ -92,7 +92,7 @@ def serve(options: Play) -> Iterator[Page]:
     server = viser.ViserServer(options.host, options.port, verbose=False)
     clock.start()
     try:
-        page = Page(server, clock, policies)
+        page = in_loop(server, lambda: Page(server, clock, policies))
         drawing = threading.Thread(target=page.run, name="drawing", daemon=True)
         drawing.start()
         gc.collect()

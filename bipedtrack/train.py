@@ -225,6 +225,11 @@ def _start(path: pathlib.Path, plan: Curriculum) -> checkpoint.Checkpoint:
         training.from_arrays(plan, found.arrays)
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(f"--start {path}: {error}") from None
+    symmetric, wanted = found.provenance.get("symmetric"), plan.network.symmetric  # older ones do not say
+    if symmetric not in (None, wanted):
+        raise checkpoint.CheckpointError(
+            f"--start {path}: was trained with network.symmetric = {str(symmetric).lower()}; the curriculum wants the other"
+        )
     return found
 
 

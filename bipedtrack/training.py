@@ -413,6 +413,7 @@ def provenance(
         "curriculum": config.name,
         "seed": seed,
         "steps": sum(call.steps for call in curriculum.calls(config)[:finished_calls]),
+        "symmetric": config.network.symmetric,
         "bipedtrack": __version__,
         "versions": {row.name: row.found for row in versions.check()},
     }

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +26,10 @@ from bipedtrack.realtime import HISTORY_SECONDS
 from bipedtrack.steering import Steering
 
 pytest.importorskip("viser")
-from bipedtrack.page import Page  # noqa: E402
+from viser.infra._async_message_buffer import AsyncMessageBuffer  # noqa: E402
+from viser.infra._messages import Message  # noqa: E402
+
+from bipedtrack.page import Page, in_loop  # noqa: E402
 from bipedtrack.scene import OUT_OF_REACH_COLOR, color_of, shape_of  # noqa: E402
 
 
@@ -307,6 +311,32 @@ def test_a_push_moves_it(tab: Tab, page: Page) -> None:
 
 
 @browser_tests
+def test_viewers_are_sent_to_from_one_thread_alone(tab: Tab, page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise viser now and then forgets to wake a viewer's writer, whose page stands still for good."""
+    push, threads, kinds = AsyncMessageBuffer.push, set(), set()
+
+    def noted(self: AsyncMessageBuffer, message: Message) -> None:
+        threads.add(threading.get_ident())
+        kinds.add(type(message).__name__)
+        push(self, message)
+
+    monkeypatch.setattr(AsyncMessageBuffer, "push", noted)
+    page._toggle_pause()
+    page._single_step()
+    page._toggle_pause()
+    page._say("a sentence")
+    page._write_down()
+    page._drag("foot", "start", page._place_foot, page._reaches_foot)
+    page._drag("foot", "update", page._place_foot, page._reaches_foot)
+    page._drag("foot", "end", page._place_foot, page._reaches_foot)
+    tab.click("Watch")
+    time.sleep(1.0)
+    assert len(kinds) >= 4  # there was something to send
+    assert threads == {in_loop(page._server, threading.get_ident)}
+    tab.click("Drive")
+
+
+@browser_tests
 def test_another_policy_takes_over_while_it_walks(tab: Tab, page: Page) -> None:
     first = page.clock.ask(lambda drive: drive.controller.policy)
     tab.click("Watch")
@@ -395,7 +425,7 @@ def test_a_foothold_dragged_out_of_reach_turns_red_and_is_moved(wide: Tab, page:
 
 @browser_tests
 def test_planned_footprints_are_seen_ahead_of_the_robot(wide: Tab, page: Page) -> None:
-    feet = ((0.3, 0.15), (0.3, -0.15))
+    feet = ((0.1, 0.3), (0.35, -0.1))  # where neither leg hides them
     lines = [f"{leg},{x},{y}" for leg, (x, y) in zip(("left", "right"), feet, strict=True)]
     script = footsteps.parse("\n".join([",".join(footsteps.COLUMNS), "both", *lines]), robots.load(), "here")
 
@@ -409,9 +439,11 @@ def test_planned_footprints_are_seen_ahead_of_the_robot(wide: Tab, page: Page) -
     assert not any(seen())
     page.clock.ask(lambda drive: drive.run(script))
     page._toggle_pause()
-    wait_until(lambda: all(seen()))
-    assert len(page.clock.view.prints) == 2
-    page._toggle_pause()
+    try:
+        wait_until(lambda: all(seen()))
+        assert len(page.clock.view.prints) == 2
+    finally:
+        page._toggle_pause()
 
 
 @browser_tests

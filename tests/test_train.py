@@ -237,12 +237,14 @@ def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(r
 def test_what_cannot_be_started_from_is_refused_and_leaves_nothing_behind(runs: Runs, tmp_path: pathlib.Path) -> None:
     smoke = (ROOT / "curricula" / "smoke.toml").read_text()
     (tmp_path / "wider.toml").write_text(smoke.replace("critic = [16]", "critic = [17]"))
+    (tmp_path / "mirrored.toml").write_text(smoke.replace("[network]", "[network]\nsymmetric = true"))
     first, policy_file = runs.whole / "checkpoints" / "0002.npz", runs.whole / "policy.npz"
     for arguments, wanted in {
         ("--start", "missing.npz"): "missing.npz: cannot be read",
         ("--start", policy_file): "is a policy file; wanted a checkpoint file",
         ("--start", tmp_path): "has no checkpoint; wanted one",
         ("--start", first, "--curriculum", "wider.toml"): "does not fit the curriculum's networks: 2/params/hidden_0/bias",
+        ("--start", first, "--curriculum", "mirrored.toml"): "was trained with network.symmetric = false",
         ("--start", first, "--resume"): "leave out --start",
     }.items():
         assert wanted in refused("--curriculum", "smoke", "--out", "run", "--device", "cpu", *arguments, cwd=tmp_path)
