@@ -35,7 +35,7 @@ def tripping() -> policy.Policy:
 
 
 @pytest.fixture(scope="module")
-def rows() -> dict[str, list[Row]]:
+def rows(unoptimised: None) -> dict[str, list[Row]]:
     policies = {"inverse kinematics": None, "trained": tripping()}
     return {name: evaluation.by_kind(plan(), which, 0.5, EPISODES, seed=1) for name, which in policies.items()}
 
