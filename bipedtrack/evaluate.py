@@ -66,7 +66,11 @@ class Subject:
     policy_period: float  # s
     actor: policy.Policy | None  # None: no feedback
     feedforward: bool
-    provenance: dict[str, Any]
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Where the policy comes from; empty where there is none."""
+        return {} if self.actor is None else self.actor.provenance
 
     def act(self, observation: Any) -> Any:
         """The network's output, (12,), for an observation, (101,)."""
@@ -79,10 +83,10 @@ def subject(name: str, options: Evaluate) -> Subject:
     """What a policy argument names, with the options' ablations. Raises in one line where there is no such policy."""
     if name in ("ik", "zero"):
         the_robot, settings, period = robot.load(), control.ControlConfig(level_feet=True), 0.02
-        actor, provenance = None, {}
+        actor = None
     else:
         actor = policy.load(name, robot.load())
-        the_robot, settings, period, provenance = actor.robot, actor.settings, actor.policy_period, actor.provenance
+        the_robot, settings, period = actor.robot, actor.settings, actor.policy_period
     if options.filter is not None:
         settings = dataclasses.replace(settings, filter=options.filter)
     if options.velocity_feedforward is not None:
@@ -91,7 +95,7 @@ def subject(name: str, options: Evaluate) -> Subject:
         ratio = np.full_like(the_robot.feedback_ratio, options.feedback_ratio)
         the_robot = dataclasses.replace(the_robot, feedback_ratio=ratio)
     feedforward = options.feedforward and name != "zero"
-    return Subject(name, the_robot, settings, period, actor, feedforward, provenance)
+    return Subject(name, the_robot, settings, period, actor, feedforward)
 
 
 class Engines:

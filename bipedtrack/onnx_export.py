@@ -58,7 +58,7 @@ def to_onnx(policy: Policy) -> onnx.ModelProto:
     def right_leads() -> str:
         """symmetry.right_leads."""
         later, earlier = difference("timer", 0, 1), constant("earlier", -symmetry.LATER)
-        ahead = apply("Less", difference("feedforward", 2, 8), constant("ahead", -symmetry.AHEAD))
+        ahead = apply("Less", difference("feedforward", *symmetry.HIP_PITCH), constant("ahead", -symmetry.AHEAD))
         both = apply("And", apply("GreaterOrEqual", later, earlier), ahead)
         return apply("Or", apply("Greater", later, constant("later", symmetry.LATER)), both)
 

@@ -128,10 +128,14 @@ class Page:
 
     def _say(self, words: str, wrong: bool = False) -> None:
         """A sentence in every viewer's corner."""
-        title, color = ("not done", "red") if wrong else ("done", None)
-        for client in self._server.get_clients().values():
-            tell = functools.partial(client.add_notification, title, words, color=color, auto_close_seconds=10)
-            in_loop(self._server, tell)
+
+        def tell() -> None:
+            for client in self._server.get_clients().values():
+                client.add_notification(
+                    "not done" if wrong else "done", words, color="red" if wrong else None, auto_close_seconds=10
+                )
+
+        in_loop(self._server, tell)
 
     def _set(self, handle: Any, name: str, value: Any) -> None:
         """A new value for an element of the page."""
@@ -232,8 +236,8 @@ class Page:
     def _save(self, event: Any) -> None:
         """The editor's text as a file, to the one who asked."""
         if event.client is not None:
-            send = functools.partial(event.client.send_file_download, "script.csv", self._text.value.encode())
-            in_loop(self._server, functools.partial(send, save_immediately=True))
+            file = "script.csv", self._text.value.encode()
+            in_loop(self._server, lambda: event.client.send_file_download(*file, save_immediately=True))
 
     def _add_watching(self) -> None:
         """Plots, push, time, policy."""

@@ -16,6 +16,7 @@ from bipedtrack.rotations import Array, namespace
 
 _POINT, _TURN = (1, -1, 1), (-1, 1, -1)  # a vector, and what turns: a rotation vector, an angular velocity
 _LEG = (-1, -1, 1, 1, 1, -1)  # hip yaw, roll, pitch, knee, ankle pitch, roll
+HIP_PITCH = (2, 8)  # left and right among the joints
 
 _SIGNS = Observation(
     *(_POINT, _TURN, 2 * _POINT, (-1, -1)),
@@ -67,8 +68,8 @@ def right_leads(flat: Array) -> Array:
     Both follow from the command alone, so no noise of a measurement lets it flicker.
     """
     left_time, right_time = flat[..., _TIMER][..., :1], flat[..., _TIMER][..., 1:]
-    left_hip, right_hip = flat[..., _FEEDFORWARD][..., 2:3], flat[..., _FEEDFORWARD][..., 8:9]
-    behind = right_hip - left_hip  # a hip pitches forward by less, or the other way, the farther its foot is ahead
+    left_hip, right_hip = (flat[..., _FEEDFORWARD][..., hip : hip + 1] for hip in HIP_PITCH)
+    behind = right_hip - left_hip  # a hip's pitch is the less the farther its foot is ahead
     later = right_time - left_time
     return (later > LATER) | ((later >= -LATER) & (behind < -AHEAD))
 
