@@ -1,4 +1,4 @@
-"""Stages and lessons as brax PPO calls, one after another: the only module that knows brax's argument names.
+"""Stages and lessons as brax PPO calls, one after another; only `ppo_arguments` knows the names of what brax is told.
 
 A call is a pure function of (parameters, call, run's seed). A run that was killed repeats its unfinished call and ends in
 bitwise the same parameters on the same machine; what a call costs to repeat is set by the curriculum (`parts`).
@@ -6,23 +6,17 @@ bitwise the same parameters on the same machine; what a call costs to repeat is 
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import functools
 import math
 import pathlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import brax.envs
 import jax
-import jax.numpy as jnp
 import numpy as np
-from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import losses, networks
 from brax.training.agents.ppo import train as ppo
-from flax import linen
 
 from bipedtrack import (
     __version__,
@@ -30,25 +24,22 @@ from bipedtrack import (
     curriculum,
     distributed,
     env,
-    observation,
+    networks,
     plans,
     policy,
     robot,
     sampling,
-    symmetry,
     tasks,
     versions,
 )
+from bipedtrack.adapted_brax import adapted_brax
 from bipedtrack.checkpoint import Checkpoint, CheckpointError
 from bipedtrack.distributed import ALONE, Process
+from bipedtrack.networks import Params
 from bipedtrack.progress import Aside, Progress
 from bipedtrack.run_directory import RunDirectory
 
 _UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
-_ACTIVATIONS = {"swish": linen.swish, "tanh": linen.tanh, "relu": linen.relu}
-assert set(_ACTIVATIONS) == set(policy.ACTIVATIONS)
-
-Params = Any  # brax's (normaliser state, policy parameters, value parameters)
 
 
 class Stopped(Exception):
@@ -92,15 +83,15 @@ def train(
     DistributedError where the processes do not agree.
     """
     found = run.latest() if run else None
-    params = None if found is None else from_arrays(config, found.arrays)
+    params = None if found is None else networks.from_arrays(config, found.arrays)
     last = distributed.from_first("last call", lambda: None if found is None else found.call, process)
     if last is not None:
-        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), _template(config))
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), networks.template(config))
         params = distributed.share_arrays(blank if params is None else params, process)
     origin = None if found is None else origin_of(found)
     for call in curriculum.calls(config)[0 if last is None else last + 1 :]:
         params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
-        arrays = to_arrays(params)
+        arrays = networks.to_arrays(params)
         if process.count > 1:
             distributed.require_agreement(arrays, process)
             progress.say(f"{process}, call {call.index + 1}: parameters {distributed.digest(arrays)}")
@@ -129,7 +120,7 @@ def _run_call(
     epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
     the_env = make_env(config, call.stage, call.lesson)
     if params is not None and call.noise is not None:
-        params = _with_noise(params, call.noise)
+        params = networks.with_noise(params, call.noise)
 
     def report(steps: int, metrics: dict[str, Any]) -> None:
         progress.update(call, steps, _figures(metrics, config.policy_period))
@@ -152,13 +143,6 @@ def _run_call(
             **ppo_arguments(config, call),
         )
     return params
-
-
-def _with_noise(params: Params, noise: float) -> Params:
-    """The parameters with another standard deviation of the actions, the same for all of them."""
-    normalizer, actor, critic = params
-    deviation = jax.tree.map(lambda log: jax.numpy.full_like(log, math.log(noise)), actor["params"]["std_logparam"])
-    return normalizer, {**actor, "params": {**actor["params"], "std_logparam": deviation}}, critic
 
 
 def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[str, Any]:
@@ -184,7 +168,7 @@ def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[
         "reward_scaling": ppo_config.reward_scaling,
         "normalize_observations": True,
         "normalize_observations_std_eps": network.normalizer_floor,
-        "network_factory": functools.partial(make_networks, network),
+        "network_factory": functools.partial(networks.make, network),
     }
 
 
@@ -206,99 +190,6 @@ def speed(config: curriculum.Curriculum, call: curriculum.Call, batch: brax.envs
     _, *later = np.diff(times[-4:])
     fastest = min(later)
     return updates * config.ppo.steps_per_update / fastest, times[-3] - times[0] - fastest
-
-
-@contextlib.contextmanager
-def adapted_brax() -> Iterator[None]:
-    """Brax's `ppo.train` with an epoch that compiles once and that JAX can keep on disk (brax 0.14.2, jax 0.9.2).
-
-    - `jax.device_put_replicated`, which brax calls for the first training state, differs from `jax.pmap`, whose output all
-      later ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares, and the epoch
-      would compile twice.
-    - Brax reports episodes by a callback into Python, and a program with one cannot be kept. Here the loss reports them.
-    - Where several processes train, what `jax.pmap` returns clings to the others' devices, and brax's mean of it fails.
-    """
-    original = jax.device_put_replicated, losses.compute_ppo_loss, jax.pmap
-    jax.device_put_replicated, losses.compute_ppo_loss = _replicate, _loss_and_episodes(losses.compute_ppo_loss)
-    if jax.process_count() > 1:
-        jax.pmap = _local(jax.pmap)
-    try:
-        yield
-    finally:
-        jax.device_put_replicated, losses.compute_ppo_loss, jax.pmap = original
-
-
-def _replicate(x: Any, devices: Sequence[Any]) -> Any:
-    axis = ppo._PMAP_AXIS_NAME
-    sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), (axis,)), jax.sharding.PartitionSpec(axis))
-    return jax.tree.map(lambda leaf: jax.device_put(jax.numpy.stack([leaf] * len(devices)), sharding), x)
-
-
-def _local(pmap: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.pmap` whose outputs hold nothing but this process's part."""
-
-    def own(array: jax.Array) -> jax.Array:
-        parts = [shard.data for shard in array.addressable_shards]
-        return jax.make_array_from_single_device_arrays(array.shape, array.sharding, parts)
-
-    def mapped(*args: Any, **kwargs: Any) -> Callable[..., Any]:
-        function = pmap(*args, **kwargs)
-        return lambda *inputs: jax.tree.map(own, function(*inputs))
-
-    return mapped
-
-
-def _loss_and_episodes(compute_loss: Callable[..., Any]) -> Callable[..., Any]:
-    """The loss, whose metrics also hold, for each step of the data, how many episodes ended and the sums of their figures.
-
-    Brax averages them over an epoch, so their ratios are means over all episodes that ended in it.
-    """
-
-    def loss(params: Any, normalizer_params: Any, data: Any, rng: Any, **settings: Any) -> Any:
-        total, metrics = compute_loss(params, normalizer_params, data, rng, **settings)
-        extras = data.extras["state_extras"]
-        ended, figures = extras["episode_done"], extras["episode_metrics"]
-        per_episode = {
-            name: value / jax.numpy.maximum(figures["length"], 1) if name.endswith("_per_step") else value
-            for name, value in figures.items()
-        }
-        episodes = {f"episode/{name}": (ended * value).mean() for name, value in per_episode.items()}
-        return total, {**metrics, **episodes, "episodes": ended.mean()}
-
-    return loss
-
-
-def make_networks(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> networks.PPONetworks:
-    """Brax's actor and critic, as a `network_factory`: Gaussian actions whose deviation is learned, not squashed."""
-    made = networks.make_ppo_networks(
-        *args,
-        **kwargs,
-        policy_hidden_layer_sizes=network.actor,
-        value_hidden_layer_sizes=network.critic,
-        activation=_ACTIVATIONS[network.activation],
-        distribution_type="normal",
-        noise_std_type="log",
-        init_noise_std=network.initial_noise,
-    )
-    return _symmetric(made) if network.symmetric else made
-
-
-def _symmetric(made: networks.PPONetworks) -> networks.PPONetworks:
-    """The networks shown the mirror image where the right foot leads, their actions mirrored back."""
-
-    def act(normalizer: Any, params: Any, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-        shown, right = symmetry.canonical(flat)
-        mean, deviation = made.policy_network.apply(normalizer, params, shown)
-        return symmetry.restored(mean, right), jnp.where(right, symmetry.swapped(deviation), deviation)
-
-    def value(normalizer: Any, params: Any, flat: jax.Array) -> jax.Array:
-        return made.value_network.apply(normalizer, params, symmetry.canonical(flat)[0])
-
-    return dataclasses.replace(
-        made,
-        policy_network=dataclasses.replace(made.policy_network, apply=act),
-        value_network=dataclasses.replace(made.value_network, apply=value),
-    )
 
 
 def call_seed(seed: int, index: int) -> int:
@@ -323,67 +214,6 @@ def _figures(metrics: dict[str, Any], policy_period: float) -> dict[str, float]:
     }
 
 
-def _template(config: curriculum.Curriculum) -> Params:
-    """Shapes and types of the parameters, without computing any."""
-
-    def build() -> Params:
-        made = make_networks(config.network, observation.SIZE, len(robot.load(config.robot).joint_names))
-        key = jax.random.PRNGKey(0)
-        normalizer = running_statistics.init_state(
-            specs.Array((observation.SIZE,), np.dtype("float32")), std_eps=config.network.normalizer_floor
-        )
-        return normalizer, made.policy_network.init(key), made.value_network.init(key)
-
-    return jax.eval_shape(build)
-
-
-def _named_leaves(params: Params) -> tuple[dict[str, Any], Any]:
-    """The leaves by their path, and the tree's structure."""
-    leaves, structure = jax.tree_util.tree_flatten_with_path(params)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}, structure
-
-
-def to_arrays(params: Params) -> dict[str, np.ndarray]:
-    """Brax's parameters as named arrays for a checkpoint."""
-    return {name: np.asarray(leaf) for name, leaf in _named_leaves(params)[0].items()}
-
-
-def from_arrays(config: curriculum.Curriculum, arrays: dict[str, np.ndarray]) -> Params:
-    """Brax's parameters from a checkpoint's arrays. Raises CheckpointError where they do not fit the curriculum."""
-    wanted, structure = _named_leaves(_template(config))
-    if set(wanted) != set(arrays):
-        odd = sorted(set(wanted) ^ set(arrays))[0]
-        raise CheckpointError(f"checkpoint does not fit the curriculum's networks: {odd} is on one side only")
-    for name, leaf in wanted.items():
-        if arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
-            raise CheckpointError(
-                f"checkpoint does not fit the curriculum's networks: {name} is {arrays[name].dtype}"
-                f"{list(arrays[name].shape)}, wanted {leaf.dtype}{list(leaf.shape)}"
-            )
-    return jax.tree_util.tree_unflatten(structure, [jax.numpy.asarray(arrays[name]) for name in wanted])
-
-
-def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], provenance: dict[str, Any]) -> policy.Policy:
-    """The exported policy of a checkpoint's arrays: the actor's mean, its normaliser and all that surrounds them."""
-    normalizer, actor, _ = from_arrays(config, arrays)
-    layers = actor["params"]["MLP_0"]
-    dense = [layers[f"hidden_{i}"] for i in range(len(config.network.actor))] + [actor["params"]["Dense_0"]]
-    return policy.Policy(
-        network=policy.Network(
-            mean=np.asarray(normalizer.mean),
-            std=np.asarray(normalizer.std),
-            weights=tuple(np.asarray(layer["kernel"]) for layer in dense),
-            biases=tuple(np.asarray(layer["bias"]) for layer in dense),
-        ),
-        activation=config.network.activation,
-        settings=config.control,
-        policy_period=config.policy_period,
-        robot=robot.load(config.robot),
-        provenance=provenance,
-        symmetric=config.network.symmetric,
-    )
-
-
 def save_policy(run: RunDirectory, path: str | pathlib.Path) -> policy.Policy:
     """Writes the policy of a run's newest intact checkpoint to `path` and returns it.
 
@@ -393,7 +223,7 @@ def save_policy(run: RunDirectory, path: str | pathlib.Path) -> policy.Policy:
     found = run.latest()
     if found is None:
         raise CheckpointError(f"{run.path}: has no checkpoint yet; its first PPO call is not finished")
-    newest = to_policy(config, found.arrays, found.provenance)
+    newest = networks.to_policy(config, found.arrays, found.provenance)
     policy.save(newest, path)
     return newest
 

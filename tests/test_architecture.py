@@ -23,7 +23,7 @@ LADDER = """
     footsteps footholds tasks scripts steering plans disturbances
     control observation symmetry rewards swings metrics verdicts charts
     policy follower onnx_export env autoreset
-    curriculum rollout progress recording suite pictures
+    curriculum adapted_brax networks rollout progress recording suite pictures
     training evaluation sheets comparisons report
     doctor train curves export evaluate simulate video teleop drive realtime scene page play __main__
 """.split()

@@ -16,7 +16,7 @@ import onnxruntime
 import pytest
 
 import bipedtrack
-from bipedtrack import config, curriculum, export, observation, policy, robot, training, versions
+from bipedtrack import config, curriculum, export, networks, observation, policy, robot, training, versions
 from bipedtrack.run_directory import RunDirectory
 
 ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
@@ -31,7 +31,7 @@ def random_arrays(plan, seed):
     def random(leaf):
         return rng.uniform(0.1, 1, leaf.shape).astype(leaf.dtype)
 
-    return training.to_arrays(jax.tree.map(random, training._template(plan)))
+    return networks.to_arrays(jax.tree.map(random, networks.template(plan)))
 
 
 def make_run(path, finished_calls=2, plan=PLAN):

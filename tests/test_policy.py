@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import networks
+from brax.training.agents.ppo import networks as ppo_networks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policies import JOINTS, ROBOT, random_network, small_policy
 
-from bipedtrack import checkpoint, curriculum, observation, policy, training
+from bipedtrack import checkpoint, curriculum, networks, observation, policy
 from bipedtrack.policy import Controller, PolicyError
 
 
@@ -58,11 +58,11 @@ def test_the_network_in_numpy_equals_the_network_in_jax(activation):
 def test_the_exported_network_equals_braxs_own(activation, symmetric):
     network = curriculum.NetworkConfig(actor=(64, 48), critic=(8,), activation=activation, symmetric=symmetric)
     plan = dataclasses.replace(curriculum.load("smoke"), network=network)
-    made = training.make_networks(network, observation.SIZE, JOINTS, preprocess_observations_fn=running_statistics.normalize)
+    made = networks.make(network, observation.SIZE, JOINTS, preprocess_observations_fn=running_statistics.normalize)
     params = random_parameters(made, network)
-    act = networks.make_inference_fn(made)(params, deterministic=True)
+    act = ppo_networks.make_inference_fn(made)(params, deterministic=True)
     wanted = np.asarray(jax.jit(act)(OBSERVATIONS, jax.random.PRNGKey(0))[0])
-    exported = training.to_policy(plan, training.to_arrays(params), {})
+    exported = networks.to_policy(plan, networks.to_arrays(params), {})
     assert_close(exported.output(OBSERVATIONS), wanted)
     # as the environment takes brax's actions
     scale = plan.control.feedback_scale

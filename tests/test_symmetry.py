@@ -11,7 +11,7 @@ from brax.training.acme import running_statistics
 from policies import ROBOT, make_policy, random_network
 from scipy.spatial.transform import Rotation
 
-from bipedtrack import control, curriculum, footsteps, kinematics, observation, planner, robot, symmetry, training
+from bipedtrack import control, curriculum, footsteps, kinematics, networks, observation, planner, robot, symmetry
 from bipedtrack.nodes import NodeRates, Nodes
 from bipedtrack.planner import Command
 
@@ -157,7 +157,7 @@ def test_a_symmetric_policy_does_as_its_mirror_image_and_another_one_does_not() 
 
 def test_braxs_networks_are_symmetric_too() -> None:
     config = curriculum.NetworkConfig(actor=(16,), critic=(8,), symmetric=True)
-    made = training.make_networks(config, observation.SIZE, 12, preprocess_observations_fn=running_statistics.normalize)
+    made = networks.make(config, observation.SIZE, 12, preprocess_observations_fn=running_statistics.normalize)
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
     actor, critic = made.policy_network.init(keys[0]), made.value_network.init(keys[1])
     # every joint with a deviation of its own, so that an exchange of legs shows

@@ -1,0 +1,123 @@
+"""Brax's actor and critic: how they are made, their parameters as arrays of a checkpoint, and the policy that ships."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks as ppo_networks
+from flax import linen
+
+from bipedtrack import curriculum, observation, policy, robot, symmetry
+from bipedtrack.checkpoint import CheckpointError
+
+_ACTIVATIONS = {"swish": linen.swish, "tanh": linen.tanh, "relu": linen.relu}
+assert set(_ACTIVATIONS) == set(policy.ACTIVATIONS)
+
+Params = Any  # brax's (normaliser state, policy parameters, value parameters)
+
+
+def make(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> ppo_networks.PPONetworks:
+    """Brax's actor and critic, as a `network_factory`: Gaussian actions whose deviation is learned, not squashed."""
+    made = ppo_networks.make_ppo_networks(
+        *args,
+        **kwargs,
+        policy_hidden_layer_sizes=network.actor,
+        value_hidden_layer_sizes=network.critic,
+        activation=_ACTIVATIONS[network.activation],
+        distribution_type="normal",
+        noise_std_type="log",
+        init_noise_std=network.initial_noise,
+    )
+    return _symmetric(made) if network.symmetric else made
+
+
+def _symmetric(made: ppo_networks.PPONetworks) -> ppo_networks.PPONetworks:
+    """The networks shown the mirror image where the right foot leads, their actions mirrored back."""
+
+    def act(normalizer: Any, params: Any, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        shown, right = symmetry.canonical(flat)
+        mean, deviation = made.policy_network.apply(normalizer, params, shown)
+        return symmetry.restored(mean, right), jnp.where(right, symmetry.swapped(deviation), deviation)
+
+    def value(normalizer: Any, params: Any, flat: jax.Array) -> jax.Array:
+        return made.value_network.apply(normalizer, params, symmetry.canonical(flat)[0])
+
+    return dataclasses.replace(
+        made,
+        policy_network=dataclasses.replace(made.policy_network, apply=act),
+        value_network=dataclasses.replace(made.value_network, apply=value),
+    )
+
+
+def with_noise(params: Params, noise: float) -> Params:
+    """The parameters with another standard deviation of the actions, the same for all of them."""
+    normalizer, actor, critic = params
+    deviation = jax.tree.map(lambda log: jnp.full_like(log, math.log(noise)), actor["params"]["std_logparam"])
+    return normalizer, {**actor, "params": {**actor["params"], "std_logparam": deviation}}, critic
+
+
+def template(config: curriculum.Curriculum) -> Params:
+    """Shapes and types of the parameters, without computing any."""
+
+    def build() -> Params:
+        made = make(config.network, observation.SIZE, len(robot.load(config.robot).joint_names))
+        key = jax.random.PRNGKey(0)
+        normalizer = running_statistics.init_state(
+            specs.Array((observation.SIZE,), np.dtype("float32")), std_eps=config.network.normalizer_floor
+        )
+        return normalizer, made.policy_network.init(key), made.value_network.init(key)
+
+    return jax.eval_shape(build)
+
+
+def _named_leaves(params: Params) -> tuple[dict[str, Any], Any]:
+    """The leaves by their path, and the tree's structure."""
+    leaves, structure = jax.tree_util.tree_flatten_with_path(params)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}, structure
+
+
+def to_arrays(params: Params) -> dict[str, np.ndarray]:
+    """Brax's parameters as named arrays for a checkpoint."""
+    return {name: np.asarray(leaf) for name, leaf in _named_leaves(params)[0].items()}
+
+
+def from_arrays(config: curriculum.Curriculum, arrays: dict[str, np.ndarray]) -> Params:
+    """Brax's parameters from a checkpoint's arrays. Raises CheckpointError where they do not fit the curriculum."""
+    wanted, structure = _named_leaves(template(config))
+    if set(wanted) != set(arrays):
+        odd = sorted(set(wanted) ^ set(arrays))[0]
+        raise CheckpointError(f"checkpoint does not fit the curriculum's networks: {odd} is on one side only")
+    for name, leaf in wanted.items():
+        if arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
+            raise CheckpointError(
+                f"checkpoint does not fit the curriculum's networks: {name} is {arrays[name].dtype}"
+                f"{list(arrays[name].shape)}, wanted {leaf.dtype}{list(leaf.shape)}"
+            )
+    return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name in wanted])
+
+
+def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], provenance: dict[str, Any]) -> policy.Policy:
+    """The exported policy of a checkpoint's arrays: the actor's mean, its normaliser and all that surrounds them."""
+    normalizer, actor, _ = from_arrays(config, arrays)
+    layers = actor["params"]["MLP_0"]
+    dense = [layers[f"hidden_{i}"] for i in range(len(config.network.actor))] + [actor["params"]["Dense_0"]]
+    return policy.Policy(
+        network=policy.Network(
+            mean=np.asarray(normalizer.mean),
+            std=np.asarray(normalizer.std),
+            weights=tuple(np.asarray(layer["kernel"]) for layer in dense),
+            biases=tuple(np.asarray(layer["bias"]) for layer in dense),
+        ),
+        activation=config.network.activation,
+        settings=config.control,
+        policy_period=config.policy_period,
+        robot=robot.load(config.robot),
+        provenance=provenance,
+        symmetric=config.network.symmetric,
+    )
