@@ -216,11 +216,12 @@ def test_a_killed_and_resumed_run_ends_in_bitwise_the_same_parameters(runs: Runs
 @pytest.mark.slow
 def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(runs: Runs) -> None:
     folder, first = runs.whole.parent, runs.whole / "checkpoints" / "0002.npz"
-    with running("--curriculum", "tiny.toml", "--out", "tuned", "--device", "cpu", "--start", first, cwd=folder) as tuned:
-        printed = wait_for(tuned, "(call 1 of 3)")
+    (folder / "one.toml").write_text("[[stages]]".join((folder / "tiny.toml").read_text().split("[[stages]]")[:2]))
+    with running("--curriculum", "one.toml", "--out", "tuned", "--device", "cpu", "--start", first, cwd=folder) as tuned:
+        printed = wait_for(tuned, "(call 1 of 1)")
         tuned.send_signal(signal.SIGINT)
         status, out, error = finished(tuned)
-    assert status == 130 and "begins with" in printed and "stopped; 0 of 3 calls are saved" in out, printed + out + error
+    assert status == 130 and "begins with" in printed and "stopped; 0 of 1 calls are saved" in out, printed + out + error
     began, source = RunDirectory(folder / "tuned").latest(), checkpoint.load_checkpoint(first)
     assert began.call == -1 and began.arrays.keys() == source.arrays.keys()
     assert all(np.array_equal(began.arrays[name], source.arrays[name]) for name in source.arrays)
@@ -230,7 +231,7 @@ def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(r
     trained = policy.load(folder / "tuned" / "policy.npz")
     assert trained.provenance["origin"]["steps"] == 576 and trained.provenance["origin"]["seed"] == 3
     newest = RunDirectory(folder / "tuned").latest()
-    assert int(newest.arrays["0/count/lo"]) == 2 * 576  # the normaliser has seen both runs
+    assert int(newest.arrays["0/count/lo"]) == 576 + 192  # the normaliser has seen both runs
 
 
 @pytest.mark.slow
