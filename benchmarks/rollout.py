@@ -114,7 +114,7 @@ def main(options: Rollout) -> None:
     """Prints a line for every case."""
     devices = measure.use_devices(options.devices)
     driven = policy.load(options.policy, robot.load())
-    plan = curriculum.load("standard")
+    plan = curriculum.load("best")
     plan = dataclasses.replace(plan, control=driven.settings, policy_period=driven.policy_period)
     model = robot.build_model(driven.robot.name)
     limit = 0.0
