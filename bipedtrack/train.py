@@ -14,7 +14,7 @@ from typing import Any, Literal, NoReturn
 
 import tyro
 
-from bipedtrack import checkpoint, compilation, config, curriculum, distributed, networks, robot, symmetry, versions
+from bipedtrack import checkpoint, compilation, config, curriculum, distributed, robot, symmetry, versions
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.messages import Refusal, fail, quiet_imports
@@ -216,7 +216,7 @@ def _directory(options: Train, job: Job, process: Process) -> RunDirectory:
 def _start(path: pathlib.Path, plan: Curriculum) -> checkpoint.Checkpoint:
     """The checkpoint to begin with. Raises CheckpointError where it is none or does not fit the curriculum's networks."""
     with quiet_imports():
-        pass
+        from bipedtrack import networks
 
     found = RunDirectory(path).latest() if path.is_dir() else checkpoint.load_checkpoint(path)
     if found is None:

@@ -88,7 +88,7 @@ def recorders(first: policy.Policy, plan: plans.Plan) -> Recorders:
 
     def act(seen: jax.Array) -> jax.Array:
         compiled.append("network")
-        return policy.apply(first.network, first.activation, seen)
+        return first.output(seen)
 
     controls = recording.Controls(first.robot, first.settings, PERIOD, act)
     mjx = recording.mjx_recorder(the_env(first, plan, env.TrackingEnv, SIZES), act)
