@@ -14,7 +14,7 @@ from brax.training.agents.ppo import train as ppo
 
 @contextlib.contextmanager
 def adapted_brax() -> Iterator[None]:
-    """Brax's `ppo.train` with an epoch that compiles once and that JAX can keep on disk (brax 0.14.2, jax 0.9.2).
+    """Brax's `ppo.train` with an epoch that compiles once and that JAX can keep on disk.
 
     - `jax.device_put_replicated`, which brax calls for the first training state, differs from `jax.pmap`, whose output all
       later ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares, and the epoch
