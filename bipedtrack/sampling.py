@@ -49,6 +49,7 @@ class Ranges(NamedTuple):
     wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.15)  # m, outwards
     wander_yaw: tuple[float, float, float] = (-0.25, 0.0, 0.25)  # rad
     push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
+    stair_push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, on stairs, where there is no room to step aside
 
     def validate(self) -> None:
         """Raises ValueError where a range does not grow."""

@@ -125,7 +125,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
     key_motion, key_task, key_posture, key_mix = jax.random.split(key, 4)
     motion, draw = _motion(key_motion, given, level=False)
     u: Array = jax.random.uniform(key_task, (5,))
-    still, on_stairs = motion.kind <= SQUAT, motion.kind == STAIRS
+    still, on_stairs, ranges = motion.kind <= SQUAT, motion.kind == STAIRS, given.ranges
     down = u[0] < given.down_share
     rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
     stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))
@@ -140,7 +140,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
         key=key_mix,
         break_every=jnp.where(breaks, jnp.floor(within(v[1], jnp.array(_BREAKS))), 1e6).astype(jnp.int32),
         pauses=v[2] < 0.5,
-        push=jnp.where(u[4] < given.push_share, given.ranges["push"][1], 0.0),
+        push=jnp.where(u[4] < given.push_share, _choose(on_stairs, ranges["stair_push"], ranges["push"])[1], 0.0),
     )
 
     distance = jnp.where(still, draw["foot_distance"], FOOT_DISTANCE)

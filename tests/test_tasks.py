@@ -449,11 +449,14 @@ def test_what_is_drawn_is_independent_of_each_other(curriculum: Curriculum, draw
 
 
 def test_pushes_come_to_their_share_of_the_episodes_and_grow_with_difficulty(curriculum: Curriculum, draw: Callable) -> None:
-    for difficulty, greatest in ((1.0, 30.0), (0.5, 15.0)):
+    ranges = curriculum.ranges._replace(stair_push=(0.0, 0.0, 8.0))
+    for difficulty, greatest, on_stairs in ((1.0, 30.0, 8.0), (0.5, 15.0, 4.0)):
         shares = Shares(1, 1, 2, 2, 2, 2)
-        push = draw(sampling.distribution(curriculum.ranges, shares, difficulty, 0.0, (1, 8), push_share=0.3)).push
-        assert set(np.unique(push)) == {0.0, greatest}
-        assert (push > 0).mean() == pytest.approx(0.3, abs=0.04)
+        task = draw(sampling.distribution(ranges, shares, difficulty, 0.0, (1, 8), push_share=0.3))
+        stairs = task.motion.kind == sampling.STAIRS
+        assert set(np.unique(task.push[~stairs])) == {0.0, greatest}
+        assert set(np.unique(task.push[stairs])) == {0.0, on_stairs}
+        assert (task.push > 0).mean() == pytest.approx(0.3, abs=0.04)
 
 
 def test_kinds_change_within_an_episode_and_a_foot_may_swing_twice(curriculum: Curriculum, robot: Robot) -> None:
