@@ -12,21 +12,17 @@ from jax.experimental.compilation_cache import compilation_cache
 from bipedtrack.adapted_brax import adapted_brax
 
 
+def train(**arguments: Any) -> None:
+    """Two robots of brax's own, whose episodes last four steps."""
+    fast = brax.envs.get_environment("fast")
+    ppo.train(environment=fast, run_evals=False, episode_length=4, num_envs=2, batch_size=2, num_minibatches=1, **arguments)
+
+
 def test_brax_compiles_its_epoch_once_and_not_twice(caplog: pytest.LogCaptureFixture) -> None:
     def compilations(epochs: int) -> int:
         caplog.clear()
         with jax.log_compiles():
-            ppo.train(
-                environment=brax.envs.get_environment("fast"),
-                num_timesteps=4 * epochs,
-                num_evals=epochs + 1,
-                run_evals=False,
-                episode_length=4,
-                num_envs=2,
-                unroll_length=2,
-                batch_size=2,
-                num_minibatches=1,
-            )
+            train(num_timesteps=4 * epochs, num_evals=epochs + 1, unroll_length=2)
         return sum("Finished XLA compilation of jit(_fun)" in record.getMessage() for record in caplog.records)
 
     once = compilations(1)
@@ -45,18 +41,8 @@ def test_an_epoch_reports_the_episodes_that_ended_in_it_and_can_be_kept_on_disk(
         for name, value in zip(names, (str(tmp_path), 0.0), strict=True):
             jax.config.update(name, value)
         with adapted_brax():
-            ppo.train(
-                environment=brax.envs.get_environment("fast"),
-                num_timesteps=48,
-                num_evals=2,
-                run_evals=False,
-                episode_length=4,
-                num_envs=2,
-                unroll_length=6,
-                batch_size=2,
-                num_minibatches=1,
-                progress_fn=lambda steps, metrics: reported.append(metrics),
-            )
+            report = lambda steps, metrics: reported.append(metrics)  # noqa: E731
+            train(num_timesteps=48, num_evals=2, unroll_length=6, progress_fn=report)
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

@@ -4,13 +4,13 @@ import hashlib
 import os
 import pathlib
 import signal
-import socket
 import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
+from ports import free_port
 
 import bipedtrack
 from bipedtrack import checkpoint, distributed
@@ -19,12 +19,6 @@ from bipedtrack.distributed import ALONE, DistributedError, Process
 ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": "--xla_backend_optimization_level=0", "COLUMNS": "200"}
 PATIENCE = 600  # s that anything may take on a busy machine
-
-
-def free_port() -> int:
-    with socket.socket() as trial:
-        trial.bind(("127.0.0.1", 0))
-        return int(trial.getsockname()[1])
 
 
 def start(folder: pathlib.Path, index: int, port: int, *arguments: str) -> subprocess.Popen[str]:
