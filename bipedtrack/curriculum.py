@@ -111,6 +111,7 @@ class Stage:
     break_share: float = 0.0  # share of the stepping episodes that pause or close up every few task steps
     scripts: tuple[str, ...] = ()  # footstep scripts that episodes follow too: names in curricula/footsteps, or files
     script_share: float = 0.0  # share of the episodes that follow one of them
+    retries: int = 0  # how many times an episode that ends in a fall begins again from a second or two before it
     rewards: RewardConfig | None = None  # where they are others than the curriculum's
     ranges: Ranges | None = None  # the same; evaluations keep to the curriculum's
 
@@ -122,6 +123,8 @@ class Stage:
         for name in ("hold_share", "mix_share", "break_share", "script_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+        if self.retries < 0:
+            raise ValueError(f"retries must not be negative, not {self.retries}")
         if not 0 <= self.hold_after[0] <= self.hold_after[1]:
             raise ValueError(f"hold_after must be two growing numbers of task steps, not {list(self.hold_after)}")
         if bool(self.scripts) != (self.script_share > 0):

@@ -39,6 +39,7 @@ from bipedtrack.networks import Params
 from bipedtrack.progress import Aside, Progress
 from bipedtrack.run_directory import RunDirectory
 
+_LOOK_BACK = 1.0  # s before a fall from which, or from up to twice as much before, it is tried again
 _UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
 
 
@@ -129,10 +130,11 @@ def _run_call(
         if wants_to_stop():
             raise Stopped
 
+    look_back = round(_LOOK_BACK / config.policy_period)
     progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
     with adapted_brax():
         _, params, _ = ppo.train(
-            environment=autoreset.AutoReset(the_env, config.episode_length),
+            environment=autoreset.AutoReset(the_env, config.episode_length, call.stage.retries, look_back),
             num_timesteps=updates * ppo_config.steps_per_update,
             num_evals=epochs + 1,
             seed=call_seed(seed, call.index),

@@ -169,6 +169,59 @@ def test_the_action_of_a_step_that_begins_an_episode_does_nothing(recording: Rec
     assert not np.array_equal(other.obs[~begins], recording.states[t + 1].obs[~begins])
 
 
+# Retries
+
+LOOK_BACK, RETRIES = 4, 2
+FALLS = {(6, 0), (17, 1), (22, 1), (27, 1), (30, 2)}  # (step, robot) before which the robot is tipped over
+
+
+@pytest.fixture(scope="module")
+def retrying() -> list[Any]:
+    """34 states of three robots, always with the same action."""
+    config = EnvConfig(rewards.RewardConfig(), control.ControlConfig(level_feet=True))
+    given = sampling.distribution(sampling.Ranges(), SHARES, 0.5, 0.0, (0, 0))
+    env = AutoReset(TrackingEnv(robots.load(), config, given), 1000, RETRIES, LOOK_BACK)
+    step = jax.jit(env.step, compiler_options=QUICK_COMPILE)
+    states = [jax.jit(env.reset, compiler_options=QUICK_COMPILE)(jax.random.split(jax.random.PRNGKey(4), 3))]
+    for t in range(33):
+        physics = states[-1].pipeline_state
+        for who in (who for when, who in FALLS if when == t):
+            physics = physics._replace(qpos=physics.qpos.at[who, 3:7].set(jnp.array([np.cos(0.7), np.sin(0.7), 0, 0])))
+        states.append(step(states[-1].replace(pipeline_state=physics), jnp.zeros((3, 12))))
+    return [jax.tree.map(np.asarray, state) for state in states]
+
+
+def going_on(state: Any, who: int) -> list[np.ndarray]:
+    """Everything that decides how the episode of one robot goes on."""
+    parts = (state.pipeline_state, state.info["episode"], state.info["clock"], state.obs)
+    return [leaf[who] for leaf in jax.tree.leaves(parts)]
+
+
+def same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_after_a_fall_the_robot_goes_back_and_everything_comes_as_it_came(retrying: list[Any]) -> None:
+    for when, who in sorted(FALLS - {(27, 1)}):
+        fallen, again = retrying[when + 1], retrying[when + 2]
+        assert fallen.done[who] == 1 and again.done[who] == 0 == again.reward[who] and again.info["truncation"][who] == 1
+        assert again.info["episode_metrics"]["length"][who] == 0
+        back = fallen.info["clock"][who] - again.info["clock"][who]
+        assert LOOK_BACK <= back < 2 * LOOK_BACK or when < 2 * LOOK_BACK
+        # as it was then, and from there on as it went before, as far as nothing else befell it
+        until = min([back, *(w - when - 1 for w, r in FALLS if r == who and w > when), 33 - when - 2])
+        for t in range(until):
+            assert same(going_on(retrying[when + 2 + t], who), going_on(retrying[when + 1 - back + t], who)), (when, who, t)
+
+
+def test_after_its_retries_a_new_episode_begins(retrying: list[Any]) -> None:
+    tries = [int(state.info["tries"][1]) for state in retrying]
+    assert tries == [0] * 19 + [1] * 5 + [2] * 5 + [0] * 5
+    new = retrying[29]
+    assert new.info["clock"][1] == 0 and new.info["episode"].index[1] == 0 and (new.pipeline_state.qvel[1] == 0).all()
+    assert not np.array_equal(new.info["episode"].task.motion.period[1], retrying[28].info["episode"].task.motion.period[1])
+
+
 # What brax's PPO makes of it
 
 
