@@ -33,7 +33,7 @@ def start(folder: pathlib.Path, index: int, port: int, *arguments: str) -> subpr
 def test_two_processes_agree_to_the_bit_and_go_on_after_one_was_lost(tmp_path: pathlib.Path) -> None:
     smoke = (ROOT / "curricula" / "smoke.toml").read_text()
     stages = smoke.split("[[stages]]")
-    one = "[[stages]]".join(stages[:2]).replace("steps = 192,", "steps = 384, parts = 2, averaged = true,")
+    one = "[[stages]]".join(stages[:2]).replace("steps = 192,", "steps = 384, parts = 2,")
     (tmp_path / "tiny.toml").write_text(one)
 
     first, second = (start(tmp_path, i, port, "--curriculum", "../tiny.toml") for port in [free_port()] for i in (0, 1))
