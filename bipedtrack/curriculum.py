@@ -83,7 +83,6 @@ class Lesson:
     parts: int = 1  # PPO calls that share the steps; a killed run repeats at most one
     push_share: float = 0.0  # share of the episodes with pushes
     noise: float | None = None  # standard deviation that exploration begins the lesson with; else it goes on as it was
-    averaged: bool = False  # each call ends with the mean of the actors along its second half, not with the last one
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.parts < 1:

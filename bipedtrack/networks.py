@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -61,12 +60,6 @@ def with_noise(params: Params, noise: float) -> Params:
     normalizer, actor, critic = params
     deviation = jax.tree.map(lambda log: jnp.full_like(log, math.log(noise)), actor["params"]["std_logparam"])
     return normalizer, {**actor, "params": {**actor["params"], "std_logparam": deviation}}, critic
-
-
-def with_mean_actor(params: Params, actors: Sequence[Any]) -> Params:
-    """The parameters with the mean of several actors: each update is a noisy step, the noise of many of them cancels."""
-    normalizer, _, critic = params
-    return normalizer, jax.tree.map(lambda *leaves: jnp.mean(jnp.stack(leaves), axis=0), *actors), critic
 
 
 def template(config: curriculum.Curriculum) -> Params:

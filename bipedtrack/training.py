@@ -91,7 +91,7 @@ def train(
         params = distributed.share_arrays(blank if params is None else params, process)
     origin = None if found is None else origin_of(found)
     for call in curriculum.calls(config)[0 if last is None else last + 1 :]:
-        params = _run_call(config, call, seed, devices, params, progress, wants_to_stop, process)
+        params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
         arrays = networks.to_arrays(params)
         if process.count > 1:
             distributed.require_agreement(arrays, process)
@@ -114,7 +114,6 @@ def _run_call(
     params: Params | None,
     progress: Progress | Aside,
     wants_to_stop: Callable[[], bool],
-    process: Process,
 ) -> Params:
     """One `ppo.train` from the given parameters. Steps are rounded up to whole epochs of whole updates."""
     ppo_config = config.ppo
@@ -127,13 +126,9 @@ def _run_call(
     def report(steps: int, metrics: dict[str, Any]) -> None:
         progress.update(call, steps, _figures(metrics, config.policy_period))
 
-    actors: list[Any] = []  # along the second half, in the first process: brax shows them to no other
-
     def look(steps: int, make_policy: Any, params: Any) -> None:
         if wants_to_stop():
             raise Stopped
-        if call.lesson.averaged and 2 * steps > call.steps:
-            actors.append(params[1])
 
     look_back = round(_LOOK_BACK / config.policy_period)
     progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
@@ -149,8 +144,6 @@ def _run_call(
             policy_params_fn=look,
             **ppo_arguments(config, call),
         )
-    if call.lesson.averaged:
-        params = distributed.share_arrays(networks.with_mean_actor(params, actors or [params[1]]), process)
     return params
 
 

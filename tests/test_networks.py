@@ -140,15 +140,3 @@ def test_another_noise_changes_the_spread_of_the_actions_alone() -> None:
     np.testing.assert_allclose(samples[1].std(axis=0), 0.2, rtol=0.06)
     assert (np.asarray(samples[0]).std(axis=0) > 0.3).all()
     assert same(params[2], quiet[2]) and same(params[0], quiet[0])
-
-
-def test_the_mean_of_actors_is_that_of_their_numbers_and_nothing_else_changes() -> None:
-    config = plan()
-    (params, _), (other, _), (third, _) = (parameters(config, seed) for seed in range(3))
-    mean = networks.to_arrays(networks.with_mean_actor(params, [params[1], other[1], third[1]]))
-    arrays = [networks.to_arrays(each) for each in (params, other, third)]
-    assert mean.keys() == arrays[0].keys()
-    moved = [name for name in mean if not np.array_equal(mean[name], arrays[0][name])]
-    assert moved == [name for name in mean if name.startswith("1/params/")]
-    for name in moved:
-        np.testing.assert_allclose(mean[name], sum(each[name].astype(float) for each in arrays) / 3, atol=1e-6)
