@@ -1,7 +1,8 @@
 """The one wrapper between the environment and brax's PPO: a batch of robots whose episodes start wholly new.
 
 When an episode ends at step t, the state keeps its terminal observation; the *next* step ignores the action and begins a
-new episode (new task, task step, robot, filter), with reward 0 and `truncation` 1. With brax's `compute_gae` this is
+new episode (new task, task step, robot, filter; or, with `retries`, the old one from before its fall), with reward 0 and
+`truncation` 1. With brax's `compute_gae` this is
 exact: at a time limit the value of step t bootstraps from the terminal observation, which is the observation of
 step t + 1; at a fall it does not (done = 1); and
 the step that begins the new episode has no value error and, before brax centres the advantages, no advantage.
