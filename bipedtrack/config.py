@@ -15,7 +15,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NoReturn, TypeVar
@@ -29,8 +29,11 @@ class ConfigError(Refusal, ValueError):
     """A configuration that does not fit its classes; the message is one line."""
 
 
-def load(cls: type[T], path: str | Path) -> T:
-    """The `cls` that the TOML file `path` describes. Raises ConfigError."""
+def load(cls: type[T], path: str | Path, complete: Callable[[dict[str, Any]], dict[str, Any]] | None = None) -> T:
+    """The `cls` that the TOML file `path` describes, once `complete` has written out what the file leaves to be inherited.
+
+    Raises ConfigError.
+    """
     place = _Place(str(path))
     try:
         text = Path(path).read_bytes().decode("utf-8-sig")
@@ -44,7 +47,7 @@ def load(cls: type[T], path: str | Path) -> T:
     except (ValueError, RecursionError) as error:
         end = f"at line {text.count(chr(10)) + 1}, the end of the file"
         place.fail(f"is not valid TOML: {str(error).replace('at end of document', end)}")
-    return from_dict(cls, data, str(path))
+    return from_dict(cls, complete(data) if complete else data, str(path))
 
 
 def from_dict(cls: type[T], data: dict[str, Any], where: str) -> T:

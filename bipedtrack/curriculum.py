@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
-from typing import Literal
+from typing import Any, Literal
 
 from bipedtrack import checkpoint, config, footsteps, paths, scripts
 from bipedtrack.control import ControlConfig
@@ -112,7 +112,7 @@ class Stage:
     scripts: tuple[str, ...] = ()  # footstep scripts that episodes follow too: names in curricula/footsteps, or files
     script_share: float = 0.0  # share of the episodes that follow one of them
     retries: int = 0  # how many times an episode that ends in a fall begins again from a second or two before it
-    rewards: RewardConfig | None = None  # where they are others than the curriculum's
+    rewards: RewardConfig | None = None  # where they are others than the curriculum's; in TOML: what differs is enough
     ranges: Ranges | None = None  # the same; evaluations keep to the curriculum's
 
     def __post_init__(self) -> None:
@@ -233,7 +233,24 @@ def load(name_or_path: str) -> Curriculum:
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
             raise config.ConfigError(f"no curriculum named {name_or_path!r} in curricula/; there are: {known}")
-    return config.load(Curriculum, path)
+    return config.load(Curriculum, path, _inherited)
+
+
+def _inherited(data: dict[str, Any]) -> dict[str, Any]:
+    """A curriculum's tables where each stage's `rewards` and `ranges` are the curriculum's but for what the stage sets."""
+    stages = data.get("stages")
+    if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
+        return data  # config says what is wrong with it
+    common = {name: data[name] for name in ("rewards", "ranges") if name in data}
+    own = [{name: _over(common[name], stage[name]) for name in common if name in stage} for stage in stages]
+    return data | {"stages": [stage | tables for stage, tables in zip(stages, own, strict=True)]}
+
+
+def _over(common: Any, own: Any) -> Any:
+    """`own` over `common`, table by table."""
+    if not (isinstance(common, dict) and isinstance(own, dict)):
+        return own
+    return common | {name: _over(common.get(name), value) for name, value in own.items()}
 
 
 def of_run(run: RunDirectory) -> tuple[Curriculum, int, int]:

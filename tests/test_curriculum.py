@@ -8,7 +8,9 @@ import pytest
 
 from bipedtrack import config, curriculum, paths
 from bipedtrack.curriculum import Curriculum, calls, load
+from bipedtrack.rewards import RewardConfig, Sharpness, Terms
 from bipedtrack.robot import Robot
+from bipedtrack.sampling import Ranges
 
 MINIMAL = """name = "mine"
 
@@ -118,6 +120,16 @@ def test_a_lesson_takes_the_value_of_its_middle_on_the_falling_line_of_its_stage
         assert call.entropy_cost == pytest.approx(0.01 - 0.01 * middle / 200)
         assert call.clipping_epsilon == pytest.approx(0.2 - 0.1 * middle / 200)
     assert (made[6].learning_rate, made[6].entropy_cost, made[6].clipping_epsilon) == (1e-4, 0.001, 0.1)
+
+
+def test_a_stage_sets_only_what_differs_from_the_curriculum(tmp_path: pathlib.Path) -> None:
+    common = "[ranges]\nperiod = [0.3, 0.5, 0.9]\nlift = [0.05, 0.06, 0.07]\n[rewards.sharpness]\nankle_yaw = 7\n"
+    weights = "[rewards.weights]\n" + "".join(f"{term} = 0.25\n" for term in Terms._fields)
+    own = "[stages.ranges]\nlift = [0.01, 0.02, 0.03]\n[stages.rewards.weights]\nlive = 2\n"
+    first, second = loaded(tmp_path, MINIMAL.replace("[[stages]]", common + weights + "[[stages]]", 1) + own).stages
+    assert first.ranges is None and first.rewards is None
+    assert second.ranges == Ranges(period=(0.3, 0.5, 0.9), lift=(0.01, 0.02, 0.03))
+    assert second.rewards == RewardConfig(Terms(*([0.25] * len(Terms._fields)))._replace(live=2.0), Sharpness(ankle_yaw=7.0))
 
 
 def test_episode_length_counts_policy_steps(tmp_path: pathlib.Path) -> None:
