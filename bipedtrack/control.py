@@ -1,4 +1,4 @@
-"""From a command and a feedback to joint targets: feedforward, mixing, clamp and filter (eqs 4-7)."""
+"""From a command and a feedback to joint targets: feedforward, mixing, integral, clamp and filter (eqs 4-7)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
+INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
+
 
 @dataclasses.dataclass(frozen=True)
 class ControlConfig:
@@ -19,12 +21,15 @@ class ControlConfig:
     feedback_scale: float = 0.2  # feedback = clip(scale x network output, -1, 1)
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
+    integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles), as a PID would; 0: PD alone
 
     def __post_init__(self) -> None:
         if not 0 < self.filter <= 1:
             raise ValueError(f"filter must lie in (0, 1], not {self.filter}")
         if not self.feedback_scale > 0:
             raise ValueError(f"feedback_scale must be positive, not {self.feedback_scale}")
+        if not self.integral >= 0:
+            raise ValueError(f"integral must not be negative, not {self.integral}")
 
 
 class ControlState(NamedTuple):
@@ -32,6 +37,7 @@ class ControlState(NamedTuple):
 
     filtered: Array  # (12,) u_{t-1} of eq (7), in [-1, 1]
     feedforward: Array  # (12,) a_ff of the last control step
+    integral: Array  # (12,) of a_ff minus the measured joint angles, times its gain, in half ranges
 
 
 def feedforward(robot: Robot, settings: ControlConfig, target: Nodes) -> Array:
@@ -65,19 +71,28 @@ def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
 
     a_ff: the feedforward of the first command, (12,), where it is another; the velocity feedforward begins at zero.
     """
-    return ControlState(namespace(standing).clip(standing, -1.0, 1.0), standing if a_ff is None else a_ff)
+    xp = namespace(standing)
+    return ControlState(xp.clip(standing, -1.0, 1.0), standing if a_ff is None else a_ff, xp.zeros_like(standing))
 
 
 def joint_targets(
-    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array
+    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array, joints: Array
 ) -> tuple[Array, ControlState]:
     """Joint targets (12,), rad, for the PD and the next state, from feedforward and feedback (12,) in [-1, 1].
+
+    `joints` are the measured joint angles (12,), rad.
 
     Eq (6) mixes a_ff + k_b a_fb; eq (7) is read as a recursive first-order low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}),
     for only the recursion bounds the rate of the targets.
     """
     xp = namespace(a_ff)
-    mixed = a_ff + xp.asarray(robot.feedback_ratio, dtype=a_ff.dtype) * a_fb
+    integral = state.integral
+    if (
+        settings.integral
+    ):  # what a PD leaves over: it needs an error to carry weight, and the feedback, a function of it, too
+        grown = integral + settings.integral * robot.timestep * (a_ff - normalize(robot, joints))
+        integral = xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+    mixed = a_ff + xp.asarray(robot.feedback_ratio, dtype=a_ff.dtype) * a_fb + integral
     filtered = xp.clip(settings.filter * mixed + (1 - settings.filter) * state.filtered, -1.0, 1.0)
     targets = denormalize(robot, filtered)
     if settings.velocity_feedforward:
@@ -86,4 +101,4 @@ def joint_targets(
         )
         low, high = (xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_low, robot.joint_high))
         targets = xp.clip(targets + lag * half * (a_ff - state.feedforward), low, high)
-    return targets, ControlState(filtered, a_ff)
+    return targets, ControlState(filtered, a_ff, integral)

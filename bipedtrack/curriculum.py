@@ -114,6 +114,7 @@ class Stage:
     retries: int = 0  # how many times an episode that ends in a fall begins again from a second or two before it
     rewards: RewardConfig | None = None  # where they are others than the curriculum's; in TOML: what differs is enough
     ranges: Ranges | None = None  # the same; evaluations keep to the curriculum's
+    control: ControlConfig | None = None  # the same; a policy keeps to that of the stage it comes from
 
     def __post_init__(self) -> None:
         if not self.lessons:
@@ -209,6 +210,11 @@ def calls(curriculum: Curriculum) -> tuple[Call, ...]:
     return tuple(found)
 
 
+def control_of(curriculum: Curriculum, stage: Stage) -> ControlConfig:
+    """The control law of a stage: its own, or the curriculum's."""
+    return stage.control or curriculum.control
+
+
 def scripts_of(stage: Stage, robot: Robot) -> list[footsteps.Script]:
     """The footstep scripts of a stage. Raises config.ConfigError where one is missing, wrong or not on level ground."""
     ready, found = scripts.ready(), []
@@ -237,11 +243,11 @@ def load(name_or_path: str) -> Curriculum:
 
 
 def _inherited(data: dict[str, Any]) -> dict[str, Any]:
-    """A curriculum's tables where each stage's `rewards` and `ranges` are the curriculum's but for what the stage sets."""
+    """A curriculum's tables with each stage's `control`, `rewards` and `ranges` over the curriculum's own."""
     stages = data.get("stages")
     if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
         return data  # config says what is wrong with it
-    common = {name: data[name] for name in ("rewards", "ranges") if name in data}
+    common = {name: data[name] for name in ("control", "rewards", "ranges") if name in data}
     own = [{name: _over(common[name], stage[name]) for name in common if name in stage} for stage in stages]
     return data | {"stages": [stage | tables for stage, tables in zip(stages, own, strict=True)]}
 

@@ -250,7 +250,9 @@ class TrackingEnv(brax.envs.Env):
         """One control step of 0.005 s with a feedback (12,): eqs (4)-(7), physics, clock."""
         wanted = self.feedforward_nodes(episode, self.command(episode))
         a_ff = control.feedforward(self.robot, self.config.control, wanted)
-        targets, memory = control.joint_targets(self.robot, self.config.control, episode.control, a_ff, a_fb)
+        targets, memory = control.joint_targets(
+            self.robot, self.config.control, episode.control, a_ff, a_fb, physics.qpos[7:]
+        )
         physics = self.simulate(physics, targets, episode.push)
         episode = self._tick(episode._replace(control=memory), following)
         boxes = self._boxes(episode.given, episode.task, episode.index)

@@ -47,7 +47,8 @@ def by_kind(
     if holds:
         given.append(_only(config, dict.fromkeys(kinds, 1.0), difficulty, 1.0, holds[-1].hold_after))
     batch = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), episodes, axis=0), *given)
-    settings = env.EnvConfig(config.rewards, config.control, config.policy_period, stairs="stairs" in kinds)
+    law = config.control if trained is None else trained.settings
+    settings = env.EnvConfig(config.rewards, law, config.policy_period, stairs="stairs" in kinds)
     the_env = env.TrackingEnv(robot.load(config.robot), settings, given[0])
 
     def act(observation: Any) -> Any:

@@ -102,8 +102,13 @@ def from_arrays(config: curriculum.Curriculum, arrays: dict[str, np.ndarray]) ->
     return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name in wanted])
 
 
-def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], provenance: dict[str, Any]) -> policy.Policy:
-    """The exported policy of a checkpoint's arrays: the actor's mean, its normaliser and all that surrounds them."""
+def to_policy(
+    config: curriculum.Curriculum, arrays: dict[str, np.ndarray], provenance: dict[str, Any], call: int = 0
+) -> policy.Policy:
+    """The exported policy of a checkpoint's arrays: the actor's mean, its normaliser and all that surrounds them.
+
+    `call` is the last finished one: the control law is that of its stage.
+    """
     normalizer, actor, _ = from_arrays(config, arrays)
     layers = actor["params"]["MLP_0"]
     dense = [layers[f"hidden_{i}"] for i in range(len(config.network.actor))] + [actor["params"]["Dense_0"]]
@@ -115,7 +120,7 @@ def to_policy(config: curriculum.Curriculum, arrays: dict[str, np.ndarray], prov
             biases=tuple(np.asarray(layer["bias"]) for layer in dense),
         ),
         activation=config.network.activation,
-        settings=config.control,
+        settings=curriculum.control_of(config, curriculum.calls(config)[max(call, 0)].stage),
         policy_period=config.policy_period,
         robot=robot.load(config.robot),
         provenance=provenance,

@@ -60,7 +60,9 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: cur
         break_share=stage.break_share,
     )
     rewards = stage.rewards or config.rewards
-    settings = env.EnvConfig(rewards, config.control, config.policy_period, stairs=stage.shares.stairs > 0)
+    settings = env.EnvConfig(
+        rewards, curriculum.control_of(config, stage), config.policy_period, stairs=stage.shares.stairs > 0
+    )
     the_robot, source = robot.load(config.robot), tasks.RANDOM
     if stage.scripts:
         library = plans.library(curriculum.scripts_of(stage, the_robot))
@@ -225,7 +227,7 @@ def save_policy(run: RunDirectory, path: str | pathlib.Path) -> policy.Policy:
     found = run.latest()
     if found is None:
         raise CheckpointError(f"{run.path}: has no checkpoint yet; its first PPO call is not finished")
-    newest = networks.to_policy(config, found.arrays, found.provenance)
+    newest = networks.to_policy(config, found.arrays, found.provenance, found.call)
     policy.save(newest, path)
     return newest
 
