@@ -7,7 +7,8 @@ import pathlib
 import pytest
 
 from bipedtrack import config, curriculum, paths
-from bipedtrack.curriculum import Curriculum, calls, load
+from bipedtrack.control import ControlConfig
+from bipedtrack.curriculum import Curriculum, calls, control_of, load
 from bipedtrack.rewards import RewardConfig, Sharpness, Terms
 from bipedtrack.robot import Robot
 from bipedtrack.sampling import Ranges
@@ -125,9 +126,13 @@ def test_a_lesson_takes_the_value_of_its_middle_on_the_falling_line_of_its_stage
 def test_a_stage_sets_only_what_differs_from_the_curriculum(tmp_path: pathlib.Path) -> None:
     common = "[ranges]\nperiod = [0.3, 0.5, 0.9]\nlift = [0.05, 0.06, 0.07]\n[rewards.sharpness]\nankle_yaw = 7\n"
     weights = "[rewards.weights]\n" + "".join(f"{term} = 0.25\n" for term in Terms._fields)
-    own = "[stages.ranges]\nlift = [0.01, 0.02, 0.03]\n[stages.rewards.weights]\nlive = 2\n"
-    first, second = loaded(tmp_path, MINIMAL.replace("[[stages]]", common + weights + "[[stages]]", 1) + own).stages
-    assert first.ranges is None and first.rewards is None
+    common += "[control]\nfilter = 0.3\n"
+    own = "[stages.ranges]\nlift = [0.01, 0.02, 0.03]\n[stages.rewards.weights]\nlive = 2\n[stages.control]\nintegral = 1\n"
+    plan = loaded(tmp_path, MINIMAL.replace("[[stages]]", common + weights + "[[stages]]", 1) + own)
+    first, second = plan.stages
+    assert first.ranges is None and first.rewards is None and first.control is None
+    assert control_of(plan, first) == ControlConfig(filter=0.3)
+    assert control_of(plan, second) == ControlConfig(filter=0.3, integral=1.0)
     assert second.ranges == Ranges(period=(0.3, 0.5, 0.9), lift=(0.01, 0.02, 0.03))
     assert second.rewards == RewardConfig(Terms(*([0.25] * len(Terms._fields)))._replace(live=2.0), Sharpness(ankle_yaw=7.0))
 

@@ -12,6 +12,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 
 from bipedtrack import curriculum, networks, policy
 from bipedtrack.checkpoint import CheckpointError
+from bipedtrack.control import ControlConfig
 
 ACTIVATIONS = ("swish", "tanh", "relu")
 
@@ -113,6 +114,16 @@ def test_the_exported_policy_carries_what_surrounds_the_network() -> None:
     assert exported.robot.name == config.robot and exported.provenance == {"seed": 3}
     assert exported.activation == config.network.activation
     assert [weight.shape for weight in exported.network.weights] == [(101, 24), (24, 8), (8, 12)]
+
+
+def test_the_exported_policy_keeps_to_the_control_law_of_the_stage_it_comes_from() -> None:
+    config, law = plan(), ControlConfig(integral=1.5)
+    config = dataclasses.replace(config, stages=(*config.stages, dataclasses.replace(config.stages[-1], control=law)))
+    arrays = networks.to_arrays(parameters(config)[0])
+    calls = curriculum.calls(config)
+    laws = [networks.to_policy(config, arrays, {}, call).settings for call in range(-1, len(calls))]
+    assert laws[0] == config.control  # before the first call
+    assert laws[1:] == [law if call.stage.control else config.control for call in calls] and laws[-1] == law
 
 
 def test_the_actor_begins_with_the_noise_of_the_curriculum_and_an_unbounded_gaussian() -> None:
