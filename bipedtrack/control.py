@@ -11,6 +11,7 @@ from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
+INTEGRAL_FADES = 0.2  # s: with this time constant while a foot is to be in the air
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +22,7 @@ class ControlConfig:
     feedback_scale: float = 0.2  # feedback = clip(scale x network output, -1, 1)
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
-    integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles), as a PID would; 0: PD alone
+    integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles) while both feet stand
 
     def __post_init__(self) -> None:
         if not 0 < self.filter <= 1:
@@ -75,24 +76,38 @@ def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
     return ControlState(xp.clip(standing, -1.0, 1.0), standing if a_ff is None else a_ff, xp.zeros_like(standing))
 
 
+def integrate(
+    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, joints: Array, timer: Array
+) -> ControlState:
+    """The state with its integral one control step on; to be called before `joint_targets`. Not in the paper.
+
+    A PD needs an error to carry weight, and the feedback, a function of that error, hardly learns to cancel the last of it:
+    the integral does, as in any PID. While a foot is to be in the air it fades, for there errors are motion, not load.
+
+    Args:
+      state: after the last control step.
+      a_ff: (12,) feedforward of this one.
+      joints: (12,) measured joint angles, rad.
+      timer: (2,) T of the command, s: 0 for a foot that is to stand.
+    """
+    if not settings.integral:
+        return state
+    xp = namespace(a_ff)
+    grown = state.integral + settings.integral * robot.timestep * (a_ff - normalize(robot, joints))
+    faded = state.integral * (1 - robot.timestep / INTEGRAL_FADES)
+    return state._replace(integral=xp.where(xp.all(timer <= 0), xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT), faded))
+
+
 def joint_targets(
-    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array, joints: Array
+    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array
 ) -> tuple[Array, ControlState]:
     """Joint targets (12,), rad, for the PD and the next state, from feedforward and feedback (12,) in [-1, 1].
 
-    `joints` are the measured joint angles (12,), rad.
-
-    Eq (6) mixes a_ff + k_b a_fb; eq (7) is read as a recursive first-order low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}),
-    for only the recursion bounds the rate of the targets.
+    Eq (6) mixes a_ff + k_b a_fb, to which the integral is added if there is one; eq (7) is read as a recursive first-order
+    low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}), for only the recursion bounds the rate of the targets.
     """
     xp = namespace(a_ff)
-    integral = state.integral
-    if (
-        settings.integral
-    ):  # what a PD leaves over: it needs an error to carry weight, and the feedback, a function of it, too
-        grown = integral + settings.integral * robot.timestep * (a_ff - normalize(robot, joints))
-        integral = xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
-    mixed = a_ff + xp.asarray(robot.feedback_ratio, dtype=a_ff.dtype) * a_fb + integral
+    mixed = a_ff + xp.asarray(robot.feedback_ratio, dtype=a_ff.dtype) * a_fb + state.integral
     filtered = xp.clip(settings.filter * mixed + (1 - settings.filter) * state.filtered, -1.0, 1.0)
     targets = denormalize(robot, filtered)
     if settings.velocity_feedforward:
@@ -101,4 +116,4 @@ def joint_targets(
         )
         low, high = (xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_low, robot.joint_high))
         targets = xp.clip(targets + lag * half * (a_ff - state.feedforward), low, high)
-    return targets, ControlState(filtered, a_ff, integral)
+    return targets, ControlState(filtered, a_ff, state.integral)

@@ -56,7 +56,7 @@ def test_mixing_worked_by_hand(robot: Robot) -> None:
     a_ff[KNEE], a_fb[KNEE] = 0.2, -0.5  # 0.2 - 0.3 x 0.5 = 0.05 of 70 deg above the middle of 70 deg
     a_fb[RIGHT_ANKLE_ROLL] = 1.0  # 0.3 of 30 deg
     unfiltered = ControlConfig(filter=1.0)
-    targets, state = control.joint_targets(robot, unfiltered, control.initial(ZERO), a_ff, a_fb, ZERO)
+    targets, state = control.joint_targets(robot, unfiltered, control.initial(ZERO), a_ff, a_fb)
     expected = robot.joint_middle.copy()
     expected[KNEE], expected[RIGHT_ANKLE_ROLL] = math.radians(73.5), math.radians(9)
     assert targets == pytest.approx(expected)
@@ -67,7 +67,7 @@ def test_filter_worked_by_hand(robot: Robot) -> None:
     settings = ControlConfig(filter=0.4)
     before, a_ff, a_fb = ZERO.copy(), ZERO.copy(), ZERO.copy()
     before[KNEE], a_ff[KNEE], a_fb[KNEE] = -0.3, 0.2, 0.5
-    targets, state = control.joint_targets(robot, settings, control.initial(before), a_ff, a_fb, ZERO)
+    targets, state = control.joint_targets(robot, settings, control.initial(before), a_ff, a_fb)
     assert state.filtered[KNEE] == pytest.approx(0.4 * (0.2 + 0.3 * 0.5) + 0.6 * -0.3)
     assert targets[KNEE] == pytest.approx(math.radians(70 + 70 * (0.14 - 0.18)))
 
@@ -77,7 +77,7 @@ def test_step_response_is_that_of_a_first_order_low_pass(robot: Robot, alpha: fl
     settings, state = ControlConfig(filter=alpha), control.initial(ZERO)
     a_ff = np.linspace(-0.9, 0.9, 12)
     for n in range(1, 30):
-        targets, state = control.joint_targets(robot, settings, state, a_ff, ZERO, ZERO)
+        targets, state = control.joint_targets(robot, settings, state, a_ff, ZERO)
         share = 1 - (1 - alpha) ** n
         assert targets == pytest.approx(robot.joint_middle + robot.joint_half_range * a_ff * share)
 
@@ -86,13 +86,13 @@ def test_targets_are_clamped_to_the_ranges_and_leave_them_at_once(robot: Robot) 
     settings, state = ControlConfig(filter=0.4), control.initial(ZERO)
     ones = np.ones(12)
     for _ in range(50):
-        targets, state = control.joint_targets(robot, settings, state, ones, ones, ZERO)  # asks for 1.3
+        targets, state = control.joint_targets(robot, settings, state, ones, ones)  # asks for 1.3
     assert targets == pytest.approx(robot.joint_high)
     # what was beyond the clamp is not remembered
-    targets, state = control.joint_targets(robot, settings, state, ZERO, ZERO, ZERO)
+    targets, state = control.joint_targets(robot, settings, state, ZERO, ZERO)
     assert state.filtered == pytest.approx(0.6 * ones)
     for _ in range(50):
-        targets, state = control.joint_targets(robot, settings, state, -ones, -ones, ZERO)
+        targets, state = control.joint_targets(robot, settings, state, -ones, -ones)
     assert targets == pytest.approx(robot.joint_low)
 
 
@@ -101,7 +101,8 @@ def test_targets_stay_within_the_ranges(
     robot: Robot, before: np.ndarray, a_ff: np.ndarray, a_fb: np.ndarray, alpha: float
 ) -> None:
     settings = ControlConfig(filter=alpha, integral=50.0)
-    targets, _ = control.joint_targets(robot, settings, control.initial(before), 5 * a_ff, a_fb, robot.joint_middle)
+    state = control.integrate(robot, settings, control.initial(before), 5 * a_ff, robot.joint_middle, np.zeros(2))
+    targets, _ = control.joint_targets(robot, settings, state, 5 * a_ff, a_fb)
     assert (targets >= robot.joint_low - 1e-12).all()
     assert (targets <= robot.joint_high + 1e-12).all()
 
@@ -110,7 +111,7 @@ def test_targets_stay_within_the_ranges(
 def test_a_controller_that_has_settled_goes_on_asking_for_the_same(robot: Robot, asked: np.ndarray) -> None:
     for velocity_feedforward in (False, True):
         settings = ControlConfig(filter=0.4, velocity_feedforward=velocity_feedforward)
-        targets, state = control.joint_targets(robot, settings, control.initial(asked), asked, ZERO, ZERO)
+        targets, state = control.joint_targets(robot, settings, control.initial(asked), asked, ZERO)
         assert targets == pytest.approx(control.denormalize(robot, asked), abs=1e-12)
         assert state.filtered == pytest.approx(asked, abs=1e-12)
 
@@ -122,31 +123,37 @@ def test_velocity_feedforward_adds_the_velocity_over_kp_times_kd(robot: Robot) -
     states = [control.initial(control.normalize(robot, start))] * 2
     for n in range(1, 20):
         a_ff = control.normalize(robot, start + velocity * 0.005 * n)
-        without, states[0] = control.joint_targets(robot, plain, states[0], a_ff, ZERO, ZERO)
-        with_it, states[1] = control.joint_targets(robot, ahead, states[1], a_ff, ZERO, ZERO)
+        without, states[0] = control.joint_targets(robot, plain, states[0], a_ff, ZERO)
+        with_it, states[1] = control.joint_targets(robot, ahead, states[1], a_ff, ZERO)
         assert with_it - without == pytest.approx(0.05 * velocity)  # kd/kp is 50 ms at every joint
 
 
 def test_velocity_feedforward_begins_at_zero_wherever_the_robot_stands(robot: Robot) -> None:
     stands, a_ff = np.linspace(-0.5, 0.5, 12), np.linspace(0.5, -0.5, 12)
     state = control.initial(stands, a_ff)
-    targets, _ = control.joint_targets(robot, ControlConfig(filter=0.4, velocity_feedforward=True), state, a_ff, ZERO, ZERO)
+    targets, _ = control.joint_targets(robot, ControlConfig(filter=0.4, velocity_feedforward=True), state, a_ff, ZERO)
     # the filter starts from where the robot stands
     assert targets == pytest.approx(control.denormalize(robot, 0.4 * a_ff + 0.6 * stands))
     assert control.initial(3 * stands).filtered == pytest.approx(np.clip(3 * stands, -1, 1))
 
 
-def test_integral_grows_with_what_the_joints_miss_and_stops_at_its_limit(robot: Robot) -> None:
-    settings, state = ControlConfig(filter=1.0, integral=2.0), control.initial(ZERO)
-    joints = robot.joint_middle - 0.02 * robot.joint_half_range  # every joint stays 0.02 below what is asked for
+def test_integral_grows_with_what_the_joints_miss_stops_at_its_limit_and_fades_in_the_air(robot: Robot) -> None:
+    settings, state = ControlConfig(integral=2.0), control.initial(ZERO)
+    joints, ones = robot.joint_middle - 0.02 * robot.joint_half_range, np.ones(12)  # every joint stays 0.02 below
+    stand, step = np.zeros(2), np.array([0.0, 0.3])
     for n in range(1, 101):
-        targets, state = control.joint_targets(robot, settings, state, ZERO, ZERO, joints)
-        assert targets == pytest.approx(robot.joint_middle + robot.joint_half_range * 2.0 * 0.02 * 0.005 * n)
+        state = control.integrate(robot, settings, state, ZERO, joints, stand)
+        assert state.integral == pytest.approx(2.0 * 0.02 * 0.005 * n * ones)
+    targets, state = control.joint_targets(robot, ControlConfig(filter=1.0), state, ZERO, ZERO)
+    assert targets == pytest.approx(robot.joint_middle + 0.02 * robot.joint_half_range)
     for _ in range(1000):
-        targets, state = control.joint_targets(robot, settings, state, ZERO, ZERO, joints)
-    assert targets == pytest.approx(robot.joint_middle + robot.joint_half_range * control.INTEGRAL_LIMIT)
-    targets, state = control.joint_targets(robot, settings, state, ZERO, ZERO, robot.joint_middle + robot.joint_half_range)
-    assert state.integral == pytest.approx((control.INTEGRAL_LIMIT - 0.01) * np.ones(12))  # it leaves the limit at once
+        state = control.integrate(robot, settings, state, ZERO, joints, stand)
+    assert state.integral == pytest.approx(control.INTEGRAL_LIMIT * ones)
+    above = control.integrate(robot, settings, state, ZERO, robot.joint_middle + robot.joint_half_range, stand)
+    assert above.integral == pytest.approx((control.INTEGRAL_LIMIT - 0.01) * ones)  # it leaves the limit at once
+    for _ in range(40):  # 0.2 s
+        state = control.integrate(robot, settings, state, ZERO, joints, step)
+    assert state.integral == pytest.approx(control.INTEGRAL_LIMIT * math.exp(-1) * ones, rel=0.02)
 
 
 @pytest.mark.parametrize("integral", [0.0, 3.0])
@@ -159,7 +166,8 @@ def test_the_integral_takes_away_what_a_load_leaves_a_pd(robot: Robot, integral:
     start = np.concatenate([[0, 0, 5, 1, 0, 0, 0], control.denormalize(robot, asked)])
     data.qpos[:], data.qfrc_applied[6:], state = start, load, control.initial(asked)
     for _ in range(1000):
-        data.ctrl[:], state = control.joint_targets(robot, settings, state, asked, ZERO, data.qpos[7:])
+        state = control.integrate(robot, settings, state, asked, data.qpos[7:], np.zeros(2))
+        data.ctrl[:], state = control.joint_targets(robot, settings, state, asked, ZERO)
         mujoco.mj_step(model, data)
         data.qpos[:7], data.qvel[:6] = start[:7], 0.0
     missed = data.qpos[7:] - start[7:]
@@ -213,12 +221,15 @@ def test_jax_gives_numpys_joint_targets(robot: Robot) -> None:
     targets = jax.tree.map(lambda x: np.asarray(x, np.float32), targets)
     before, a_fb = random.uniform(-1, 1, (2, 200, 12)).astype(np.float32)
 
-    def run(target: Nodes, before: Any, a_fb: Any) -> tuple:
+    def run(target: Nodes, before: Any, a_fb: Any, timer: Any) -> tuple:
         a_ff = control.feedforward(single, settings, target)
-        return a_ff, *control.joint_targets(single, settings, control.initial(before), a_ff, a_fb, single.joint_middle)
+        state = control.initial(before)._replace(integral=0.1 * a_fb)
+        state = control.integrate(single, settings, state, a_ff, single.joint_middle, timer)
+        return a_ff, *control.joint_targets(single, settings, state, a_ff, a_fb)
 
-    in_jax = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *targets), before, a_fb)
-    in_numpy = jax.tree.map(lambda *x: np.stack(x), *map(run, targets, before, a_fb))
+    timers = np.where(np.arange(200)[:, None] % 2, 0.0, [0.0, 0.2]).astype(np.float32)
+    in_jax = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *targets), before, a_fb, timers)
+    in_numpy = jax.tree.map(lambda *x: np.stack(x), *map(run, targets, before, a_fb, timers))
     # the velocity feedforward differentiates: kd/kp over 5 ms multiplies the rounding by ten
     for found, expected in zip(jax.tree.leaves(in_jax), jax.tree.leaves(in_numpy), strict=True):
         assert found.dtype == expected.dtype == np.float32

@@ -103,9 +103,7 @@ def follow(env, state, step, seconds):
         largest_feedback = max(largest_feedback, np.abs(after.feedback).max())
         if env.substeps == 1:
             a_ff = after.control.feedforward
-            wanted, _ = control.joint_targets(
-                robot32, env.config.control, episode.control, a_ff, after.feedback, physics.qpos[7:]
-            )
+            wanted, _ = control.joint_targets(robot32, env.config.control, episode.control, a_ff, after.feedback)
         else:
             assert not env.config.control.velocity_feedforward
             wanted = control.denormalize(robot32, after.control.filtered)
