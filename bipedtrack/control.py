@@ -1,12 +1,13 @@
-"""From a command and a feedback to joint targets: feedforward, mixing, integral, clamp and filter (eqs 4-7)."""
+"""From a command and a feedback to joint targets: feedforward, mixing, clamp and filter (eqs 4-7), and what a PD lacks."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import NamedTuple
 
-from bipedtrack import kinematics
+from bipedtrack import kinematics, statics
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
+from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
@@ -22,6 +23,7 @@ class ControlConfig:
     feedback_scale: float = 0.2  # feedback = clip(scale x network output, -1, 1)
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
+    gravity_feedforward: bool = False  # adds the torques that hold the commanded posture up, over kp (`statics.load`)
     integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles) while both feet stand
 
     def __post_init__(self) -> None:
@@ -79,7 +81,7 @@ def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
 def integrate(
     robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, joints: Array, timer: Array
 ) -> ControlState:
-    """The state with its integral one control step on; to be called before `joint_targets`. Not in the paper.
+    """The state with its integral one control step on. Not in the paper.
 
     A PD needs an error to carry weight, and the feedback, a function of that error, hardly learns to cancel the last of it:
     the integral does, as in any PID. While a foot is to be in the air it fades, for there errors are motion, not load.
@@ -99,15 +101,18 @@ def integrate(
 
 
 def joint_targets(
-    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array
+    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, a_fb: Array, load: Array | None = None
 ) -> tuple[Array, ControlState]:
     """Joint targets (12,), rad, for the PD and the next state, from feedforward and feedback (12,) in [-1, 1].
 
-    Eq (6) mixes a_ff + k_b a_fb, to which the integral is added if there is one; eq (7) is read as a recursive first-order
-    low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}), for only the recursion bounds the rate of the targets.
+    Eq (6) mixes a_ff + k_b a_fb, to which the integral and, for a `load` (12,) in N m, load / kp are added; eq (7) is read as
+    a recursive first-order low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}), for only the recursion bounds the rate of the
+    targets.
     """
     xp = namespace(a_ff)
     mixed = a_ff + xp.asarray(robot.feedback_ratio, dtype=a_ff.dtype) * a_fb + state.integral
+    if load is not None:
+        mixed = mixed + load / xp.asarray(robot.kp * robot.joint_half_range, dtype=a_ff.dtype)
     filtered = xp.clip(settings.filter * mixed + (1 - settings.filter) * state.filtered, -1.0, 1.0)
     targets = denormalize(robot, filtered)
     if settings.velocity_feedforward:
@@ -117,3 +122,28 @@ def joint_targets(
         low, high = (xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_low, robot.joint_high))
         targets = xp.clip(targets + lag * half * (a_ff - state.feedforward), low, high)
     return targets, ControlState(filtered, a_ff, state.integral)
+
+
+def respond(
+    robot: Robot,
+    settings: ControlConfig,
+    state: ControlState,
+    a_ff: Array,
+    a_fb: Array,
+    command: Command,
+    joints: Array,
+) -> tuple[Array, ControlState]:
+    """The whole law of a control step: `integrate`, the load of the commanded posture, `joint_targets`.
+
+    Args:
+      state: after the last control step.
+      a_ff, a_fb: (12,) feedforward and feedback in [-1, 1].
+      command: of this instant.
+      joints: (12,) measured joint angles, rad.
+    """
+    state = integrate(robot, settings, state, a_ff, joints, command.timer)
+    load = None
+    if settings.gravity_feedforward:
+        posture = denormalize(robot, a_ff)
+        load = statics.load(robot, posture, command.target.trunk_orientation, command.timer <= 0)
+    return joint_targets(robot, settings, state, a_ff, a_fb, load)

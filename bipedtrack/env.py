@@ -250,9 +250,9 @@ class TrackingEnv(brax.envs.Env):
         """One control step of 0.005 s with a feedback (12,): eqs (4)-(7), physics, clock."""
         command = self.command(episode)
         a_ff = control.feedforward(self.robot, self.config.control, self.feedforward_nodes(episode, command))
-        joints = physics.qpos[7:]
-        memory = control.integrate(self.robot, self.config.control, episode.control, a_ff, joints, command.timer)
-        targets, memory = control.joint_targets(self.robot, self.config.control, memory, a_ff, a_fb)
+        targets, memory = control.respond(
+            self.robot, self.config.control, episode.control, a_ff, a_fb, command, physics.qpos[7:]
+        )
         physics = self.simulate(physics, targets, episode.push)
         episode = self._tick(episode._replace(control=memory), following)
         boxes = self._boxes(episode.given, episode.task, episode.index)

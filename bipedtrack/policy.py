@@ -286,9 +286,10 @@ class Controller:
             self._memory = control.initial(self._standing, a_ff)
         if self.uses_feedback and self._tick % self._hold == 0:
             self._feedback = self.policy.feedback(self._observe(qpos, qvel, command, a_ff))
-        settings, joints = self.policy.settings, np.asarray(qpos, np.float32)[7:]
-        memory = control.integrate(self.robot, settings, self._memory, a_ff, joints, command.timer)
-        targets, self._memory = control.joint_targets(self.robot, settings, memory, a_ff, self._feedback)
+        joints = np.asarray(qpos, np.float32)[7:]
+        targets, self._memory = control.respond(
+            self.robot, self.policy.settings, self._memory, a_ff, self._feedback, command, joints
+        )
         self._tick += 1
         return targets
 
