@@ -105,8 +105,8 @@ def joint_targets(
 ) -> tuple[Array, ControlState]:
     """Joint targets (12,), rad, for the PD and the next state, from feedforward and feedback (12,) in [-1, 1].
 
-    Eq (6) mixes a_ff + k_b a_fb, to which the integral and, for a `load` (12,) in N m, load / kp are added; eq (7) is read as
-    a recursive first-order low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}), for only the recursion bounds the rate of the
+    Eq (6) mixes a_ff + k_b a_fb, to which the integral and, for a `load` (12,) in N m, load / kp are added; eq (7) is read
+    as a recursive first-order low pass, u_t = clamp(α a_t + (1 - α) u_{t-1}), for only the recursion bounds the rate of the
     targets.
     """
     xp = namespace(a_ff)
