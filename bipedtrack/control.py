@@ -6,13 +6,14 @@ import dataclasses
 from typing import NamedTuple
 
 from bipedtrack import kinematics, statics
-from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
+from bipedtrack.nodes import Nodes, ankles_in_trunk_frame, stationary
 from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
-INTEGRAL_FADES = 0.2  # s: with this time constant while a foot is to be in the air
+INTEGRAL_SPEED = 0.3  # rad/s: it waits while any joint is faster
+INTEGRAL_FADES = 0.2  # s: with this time constant while the command moves
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +25,7 @@ class ControlConfig:
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
     gravity_feedforward: bool = False  # adds the torques that hold the commanded posture up, over kp (`statics.load`)
-    integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles) while both feet stand
+    integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles) at rest
 
     def __post_init__(self) -> None:
         if not 0 < self.filter <= 1:
@@ -79,25 +80,28 @@ def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
 
 
 def integrate(
-    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, joints: Array, timer: Array
+    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, joints: Array, velocities: Array, rests: Array
 ) -> ControlState:
     """The state with its integral one control step on. Not in the paper.
 
     A PD needs an error to carry weight, and the feedback, a function of that error, hardly learns to cancel the last of it:
-    the integral does, as in any PID. While a foot is to be in the air it fades, for there errors are motion, not load.
+    the integral does, as in any PID. It waits until the robot has come to rest, for until then errors are motion, not load,
+    and fades while the command moves.
 
     Args:
       state: after the last control step.
       a_ff: (12,) feedforward of this one.
       joints: (12,) measured joint angles, rad.
-      timer: (2,) T of the command, s: 0 for a foot that is to stand.
+      velocities: (12,) of the joints, rad/s.
+      rests: () bool, whether the command stands still.
     """
     if not settings.integral:
         return state
     xp = namespace(a_ff)
     grown = state.integral + settings.integral * robot.timestep * (a_ff - normalize(robot, joints))
-    faded = state.integral * (1 - robot.timestep / INTEGRAL_FADES)
-    return state._replace(integral=xp.where(xp.all(timer <= 0), xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT), faded))
+    at_rest = xp.all(xp.abs(velocities) < INTEGRAL_SPEED)
+    kept = xp.where(at_rest, xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT), state.integral)
+    return state._replace(integral=xp.where(rests, kept, state.integral * (1 - robot.timestep / INTEGRAL_FADES)))
 
 
 def joint_targets(
@@ -132,6 +136,7 @@ def respond(
     a_fb: Array,
     command: Command,
     joints: Array,
+    velocities: Array,
 ) -> tuple[Array, ControlState]:
     """The whole law of a control step: `integrate`, the load of the commanded posture, `joint_targets`.
 
@@ -139,9 +144,9 @@ def respond(
       state: after the last control step.
       a_ff, a_fb: (12,) feedforward and feedback in [-1, 1].
       command: of this instant.
-      joints: (12,) measured joint angles, rad.
+      joints, velocities: (12,) measured, rad and rad/s.
     """
-    state = integrate(robot, settings, state, a_ff, joints, command.timer)
+    state = integrate(robot, settings, state, a_ff, joints, velocities, stationary(command.rates))
     load = None
     if settings.gravity_feedforward:
         posture = denormalize(robot, a_ff)

@@ -74,3 +74,9 @@ def ankles_in_trunk_frame(nodes: Nodes) -> tuple[Array, Array]:
     x = cosine * to_b[0, 0] + sine * to_b[1, 0]
     y = cosine * to_b[0, 1] + sine * to_b[1, 1]
     return positions, xp.atan2(y, x)
+
+
+def stationary(rates: NodeRates) -> Array:
+    """() bool: whether the target velocities of all three nodes are zero, but for the rounding of float32."""
+    xp = namespace(rates.trunk_velocity)
+    return xp.all(xp.abs(xp.concat([part.reshape(-1) for part in rates])) < 1e-5)

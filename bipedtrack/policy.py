@@ -286,9 +286,9 @@ class Controller:
             self._memory = control.initial(self._standing, a_ff)
         if self.uses_feedback and self._tick % self._hold == 0:
             self._feedback = self.policy.feedback(self._observe(qpos, qvel, command, a_ff))
-        joints = np.asarray(qpos, np.float32)[7:]
+        joints, velocities = np.asarray(qpos, np.float32)[7:], np.asarray(qvel, np.float32)[6:]
         targets, self._memory = control.respond(
-            self.robot, self.policy.settings, self._memory, a_ff, self._feedback, command, joints
+            self.robot, self.policy.settings, self._memory, a_ff, self._feedback, command, joints, velocities
         )
         self._tick += 1
         return targets

@@ -14,8 +14,7 @@ import numpy as np
 
 from bipedtrack import control, env, kinematics, observation, planner, plans, robot
 from bipedtrack.disturbances import UNDISTURBED, Hooks
-from bipedtrack.nodes import Nodes
-from bipedtrack.rewards import stationary
+from bipedtrack.nodes import Nodes, stationary
 from bipedtrack.rotations import Array
 from bipedtrack.trace import Trace, upright
 
@@ -142,7 +141,9 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
         seen = observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, memory.feedback))
         fresh = jnp.clip(controls.settings.feedback_scale * controls.act(seen), -1.0, 1.0)
         a_fb = jnp.where(think, fresh, memory.feedback)
-        targets, state = control.respond(the_robot, controls.settings, memory.control, a_ff, a_fb, command, qpos[7:])
+        targets, state = control.respond(
+            the_robot, controls.settings, memory.control, a_ff, a_fb, command, qpos[7:], qvel[6:]
+        )
         return targets, _Memory(state, a_fb), command.target, command.timer, stationary(command.rates)
 
     start = jax.jit(jax.vmap(lambda plan: _start(the_robot, controls.settings, plan)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from bipedtrack import nodes
 from bipedtrack.nodes import NodeErrors, NodeRates
 from bipedtrack.rotations import Array, namespace
 
@@ -69,12 +70,6 @@ def norm(x: Array) -> Array:
     return xp.sqrt((x * x).sum(axis=-1))
 
 
-def stationary(rates: NodeRates) -> Array:
-    """() bool: whether the target velocities of all three nodes are zero, but for the rounding of float32."""
-    xp = namespace(rates.trunk_velocity)
-    return xp.all(xp.abs(xp.concat([part.reshape(-1) for part in rates])) < 1e-5)
-
-
 def terms(
     sharpness: Sharpness,
     errors: NodeErrors,
@@ -92,7 +87,7 @@ def terms(
 
     ankles = xp.exp(-sharpness.ankle_position * norm(errors.ankle_positions))
     yaws = xp.exp(-sharpness.ankle_yaw * xp.abs(errors.ankle_yaws))
-    still = stationary(rates)
+    still = nodes.stationary(rates)
     zero = xp.zeros_like(a_fb[0])
     return Terms(
         live=xp.ones_like(a_fb[0]),

@@ -14,7 +14,6 @@ import tyro
 
 from bipedtrack import footsteps, kinematics, metrics, nodes, planner, policy, robot, trace
 from bipedtrack.messages import fail
-from bipedtrack.rewards import stationary
 
 
 def model_and_data(script: footsteps.Script, name: str = "ranger_max") -> tuple[Any, Any]:
@@ -61,7 +60,7 @@ def control_step(controller: policy.Controller, model: Any, data: Any, command: 
         data.ctrl[:] = controller.step(data.qpos, data.qvel, command)
     mujoco.mj_step(model, data)
     answer = [controller.last_feedback, data.ctrl.copy(), data.actuator_force.copy(), data.sensordata.copy()]
-    return [*state, command.target, measured, command.timer, stationary(command.rates), *answer, alive]
+    return [*state, command.target, measured, command.timer, nodes.stationary(command.rates), *answer, alive]
 
 
 def to_trace(rows: list[list[Any]]) -> trace.Trace:

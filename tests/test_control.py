@@ -101,7 +101,7 @@ def test_targets_stay_within_the_ranges(
     robot: Robot, before: np.ndarray, a_ff: np.ndarray, a_fb: np.ndarray, alpha: float
 ) -> None:
     settings = ControlConfig(filter=alpha, integral=50.0)
-    state = control.integrate(robot, settings, control.initial(before), 5 * a_ff, robot.joint_middle, np.zeros(2))
+    state = control.integrate(robot, settings, control.initial(before), 5 * a_ff, robot.joint_middle, ZERO, np.array(True))
     targets, _ = control.joint_targets(robot, settings, state, 5 * a_ff, a_fb)
     assert (targets >= robot.joint_low - 1e-12).all()
     assert (targets <= robot.joint_high + 1e-12).all()
@@ -137,22 +137,27 @@ def test_velocity_feedforward_begins_at_zero_wherever_the_robot_stands(robot: Ro
     assert control.initial(3 * stands).filtered == pytest.approx(np.clip(3 * stands, -1, 1))
 
 
-def test_integral_grows_with_what_the_joints_miss_stops_at_its_limit_and_fades_in_the_air(robot: Robot) -> None:
+def test_integral_grows_with_what_the_joints_miss_stops_at_its_limit_and_fades_in_motion(robot: Robot) -> None:
     settings, state = ControlConfig(integral=2.0), control.initial(ZERO)
     joints, ones = robot.joint_middle - 0.02 * robot.joint_half_range, np.ones(12)  # every joint stays 0.02 below
-    stand, step = np.zeros(2), np.array([0.0, 0.3])
+    stand, step = np.array(True), np.array(False)
     for n in range(1, 101):
-        state = control.integrate(robot, settings, state, ZERO, joints, stand)
+        state = control.integrate(robot, settings, state, ZERO, joints, ZERO, stand)
         assert state.integral == pytest.approx(2.0 * 0.02 * 0.005 * n * ones)
     targets, state = control.joint_targets(robot, ControlConfig(filter=1.0), state, ZERO, ZERO)
     assert targets == pytest.approx(robot.joint_middle + 0.02 * robot.joint_half_range)
     for _ in range(1000):
-        state = control.integrate(robot, settings, state, ZERO, joints, stand)
+        state = control.integrate(robot, settings, state, ZERO, joints, ZERO, stand)
     assert state.integral == pytest.approx(control.INTEGRAL_LIMIT * ones)
-    above = control.integrate(robot, settings, state, ZERO, robot.joint_middle + robot.joint_half_range, stand)
+    above = control.integrate(robot, settings, state, ZERO, robot.joint_middle + robot.joint_half_range, ZERO, stand)
     assert above.integral == pytest.approx((control.INTEGRAL_LIMIT - 0.01) * ones)  # it leaves the limit at once
+    fast = ZERO.copy()
+    fast[KNEE] = 0.31  # rad/s
+    assert control.integrate(robot, settings, state, ZERO, robot.joint_middle, fast, stand).integral == pytest.approx(
+        state.integral
+    )
     for _ in range(40):  # 0.2 s
-        state = control.integrate(robot, settings, state, ZERO, joints, step)
+        state = control.integrate(robot, settings, state, ZERO, joints, ZERO, step)
     assert state.integral == pytest.approx(control.INTEGRAL_LIMIT * math.exp(-1) * ones, rel=0.02)
 
 
@@ -166,7 +171,7 @@ def test_the_integral_takes_away_what_a_load_leaves_a_pd(robot: Robot, integral:
     start = np.concatenate([[0, 0, 5, 1, 0, 0, 0], control.denormalize(robot, asked)])
     data.qpos[:], data.qfrc_applied[6:], state = start, load, control.initial(asked)
     for _ in range(1000):
-        state = control.integrate(robot, settings, state, asked, data.qpos[7:], np.zeros(2))
+        state = control.integrate(robot, settings, state, asked, data.qpos[7:], data.qvel[6:], np.array(True))
         data.ctrl[:], state = control.joint_targets(robot, settings, state, asked, ZERO)
         mujoco.mj_step(model, data)
         data.qpos[:7], data.qvel[:6] = start[:7], 0.0
@@ -221,15 +226,15 @@ def test_jax_gives_numpys_joint_targets(robot: Robot) -> None:
     targets = jax.tree.map(lambda x: np.asarray(x, np.float32), targets)
     before, a_fb = random.uniform(-1, 1, (2, 200, 12)).astype(np.float32)
 
-    def run(target: Nodes, before: Any, a_fb: Any, timer: Any) -> tuple:
+    def run(target: Nodes, before: Any, a_fb: Any, rests: Any) -> tuple:
         a_ff = control.feedforward(single, settings, target)
         state = control.initial(before)._replace(integral=0.1 * a_fb)
-        state = control.integrate(single, settings, state, a_ff, single.joint_middle, timer)
+        state = control.integrate(single, settings, state, a_ff, single.joint_middle, 0.5 * a_fb, rests)
         return a_ff, *control.joint_targets(single, settings, state, a_ff, a_fb)
 
-    timers = np.where(np.arange(200)[:, None] % 2, 0.0, [0.0, 0.2]).astype(np.float32)
-    in_jax = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *targets), before, a_fb, timers)
-    in_numpy = jax.tree.map(lambda *x: np.stack(x), *map(run, targets, before, a_fb, timers))
+    rests = np.arange(200) % 2 == 0
+    in_jax = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *targets), before, a_fb, rests)
+    in_numpy = jax.tree.map(lambda *x: np.stack(x), *map(run, targets, before, a_fb, rests))
     # the velocity feedforward differentiates: kd/kp over 5 ms multiplies the rounding by ten
     for found, expected in zip(jax.tree.leaves(in_jax), jax.tree.leaves(in_numpy), strict=True):
         assert found.dtype == expected.dtype == np.float32

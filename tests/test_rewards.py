@@ -133,7 +133,7 @@ def over_instants(function: Callable) -> Callable:
     return jax.jit(jax.vmap(jax.vmap(jax.vmap(function))))
 
 
-stationary = over_instants(rewards.stationary)
+stationary = over_instants(nodes.stationary)
 
 
 @pytest.mark.parametrize("kind", ["stand", "squat", "walk", "turn", "stairs"])
