@@ -44,7 +44,7 @@ def drawn(kind, hold=False, ranges=None, difficulty=1.0):
 @pytest.fixture(scope="module")
 def env_200_hz():
     """Policy and control at one rate, and every option of the control law other than by default."""
-    return make_env(0.005, ControlConfig(filter=0.25, level_feet=True, velocity_feedforward=True))
+    return make_env(0.005, ControlConfig(0.25, 0.3, True, True, gravity_feedforward=True, integral=2.0))
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,8 @@ def follow(env, state, step, seconds):
         largest_feedback = max(largest_feedback, np.abs(after.feedback).max())
         if env.substeps == 1:
             a_ff = after.control.feedforward
-            wanted, _ = control.joint_targets(robot32, env.config.control, episode.control, a_ff, after.feedback)
+            seen = (now, physics.qpos[7:], physics.qvel[6:])
+            wanted, _ = control.respond(robot32, env.config.control, episode.control, a_ff, after.feedback, *seen)
         else:
             assert not env.config.control.velocity_feedforward
             wanted = control.denormalize(robot32, after.control.filtered)
