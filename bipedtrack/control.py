@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 from bipedtrack import kinematics, statics
@@ -32,8 +33,8 @@ class ControlConfig:
             raise ValueError(f"filter must lie in (0, 1], not {self.filter}")
         if not self.feedback_scale > 0:
             raise ValueError(f"feedback_scale must be positive, not {self.feedback_scale}")
-        if not self.integral >= 0:
-            raise ValueError(f"integral must not be negative, not {self.integral}")
+        if not 0 <= self.integral < math.inf:
+            raise ValueError(f"integral must be finite and not negative, not {self.integral}")
 
 
 class ControlState(NamedTuple):

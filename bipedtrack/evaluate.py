@@ -52,6 +52,10 @@ class Evaluate:
     """Another filter coefficient of eq (7)."""
     velocity_feedforward: bool | None = None
     """With or without (kd/kp) dq/dt."""
+    gravity_feedforward: bool | None = None
+    """With or without the static torques of the commanded posture, over kp."""
+    integral: float | None = None
+    """Another gain of the joints' integral at rest, 1/s; 0: none."""
     feedforward: bool = True
     """--no-feedforward: the feedforward stays at the first command's."""
 
@@ -87,10 +91,8 @@ def subject(name: str, options: Evaluate) -> Subject:
     else:
         actor = policy.load(name, robot.load())
         the_robot, settings, period = actor.robot, actor.settings, actor.policy_period
-    if options.filter is not None:
-        settings = dataclasses.replace(settings, filter=options.filter)
-    if options.velocity_feedforward is not None:
-        settings = dataclasses.replace(settings, velocity_feedforward=options.velocity_feedforward)
+    asked = {name: getattr(options, name) for name in ("filter", "velocity_feedforward", "gravity_feedforward", "integral")}
+    settings = dataclasses.replace(settings, **{name: value for name, value in asked.items() if value is not None})
     if options.feedback_ratio is not None:
         ratio = np.full_like(the_robot.feedback_ratio, options.feedback_ratio)
         the_robot = dataclasses.replace(the_robot, feedback_ratio=ratio)

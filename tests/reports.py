@@ -88,7 +88,7 @@ def make(robot: Robot) -> dict[str, Any]:
         "feedback_ratio": None,
         "filter": 0.1,
     }
-    options |= {"velocity_feedforward": None, "feedforward": True}
+    options |= {"velocity_feedforward": None, "gravity_feedforward": None, "integral": None, "feedforward": True}
     results = {name: dict.fromkeys(ENGINES, one) for name in options["policies"]}
     levels = [{"level": v, "survival": one["summary"]["survival"], "errors": one["summary"]["errors"]} for v in (0.0, 17.5)]
     ladder = {"unit": "N s", "levels": levels, "episodes": 4, "task": "walk-forward"}

@@ -19,7 +19,7 @@ import tyro
 from traces import by_mujoco
 
 import bipedtrack
-from bipedtrack import evaluate, footsteps, kinematics, metrics, policy, suite, trace
+from bipedtrack import evaluate, footsteps, kinematics, metrics, policy, statics, suite, trace
 from bipedtrack import robot as robots
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 
@@ -182,8 +182,8 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 def test_feedback_ratio_0_is_ik(short: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    # the policy has velocity feedforward, `ik` has none unless told
-    arguments = ["ik", str(FIRST), "--feedback-ratio", "0", "--velocity-feedforward", "True"]
+    # the policy has velocity feedforward and an integral, `ik` has neither unless told
+    arguments = ["ik", str(FIRST), "--feedback-ratio", "0", "--velocity-feedforward", "True", "--integral", "0.5"]
     arguments += ["--script", str(short), "--engine", "mujoco"]
     found = evaluate.run(tyro.cli(evaluate.Evaluate, args=[*arguments, "--out", str(tmp_path)]))
     ik, ablated = found["tasks"]["short"]["policies"].values()
@@ -245,12 +245,12 @@ def follow(robot: robots.Robot, found: trace.Trace) -> np.ndarray:
 def test_filter_feedback_ratio_and_feedforward_are_those_asked_for(
     record: Callable[..., trace.Trace], robot: robots.Robot
 ) -> None:
-    found = record(FIRST, "--filter", 1, "--feedback-ratio", 0.1, "--velocity-feedforward", False)
+    found = record(FIRST, "--filter", 1, "--feedback-ratio", 0.1, "--velocity-feedforward", False, "--integral", 0)
     wanted = follow(robot, found) + 0.1 * robot.joint_half_range * found.feedback[0]
     np.testing.assert_allclose(found.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-5)
     assert np.abs(found.feedback).max() > 0.01
 
-    stays = record(FIRST, "--filter", 1, "--no-feedforward")
+    stays = record(FIRST, "--filter", 1, "--no-feedforward", "--integral", 0)
     wanted = follow(robot, stays)[:1] + 0.3 * robot.joint_half_range * stays.feedback[0]
     np.testing.assert_allclose(stays.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-5)
     assert np.ptp(follow(robot, stays), axis=0).max() > 0.1
@@ -263,6 +263,21 @@ def test_velocity_feedforward_is_switched_on(record: Callable[..., trace.Trace],
     wanted = joints + robot.kd / robot.kp * speeds
     np.testing.assert_allclose(found.joint_targets[0], wanted.clip(robot.joint_low, robot.joint_high), atol=1e-4)
     assert np.abs(wanted - joints).max() > 0.02
+
+
+def test_gravity_feedforward_is_switched_on(record: Callable[..., trace.Trace], robot: robots.Robot) -> None:
+    found = record("ik", "--filter", 1, "--gravity-feedforward", True)
+    joints = follow(robot, found)[0]
+    load = statics.load(robot, joints, found.target.trunk_orientation[0, 0], found.timer[0, 0] <= 0)
+    np.testing.assert_allclose(found.joint_targets[0, 0], joints + load / robot.kp, atol=1e-4)
+    assert np.abs(load / robot.kp).max() > 0.02
+
+
+def test_the_integral_is_the_one_asked_for() -> None:
+    gains = [evaluate.subject("ik", evaluate.Evaluate(("ik",), integral=gain)).settings.integral for gain in (None, 2.0)]
+    assert gains == [0.0, 2.0]
+    with pytest.raises(ValueError, match="integral must be finite and not negative"):
+        evaluate.subject("ik", evaluate.Evaluate(("ik",), integral=-1.0))
 
 
 def test_a_run_directory_stands_for_its_policy(tmp_path: pathlib.Path) -> None:
