@@ -18,7 +18,7 @@ LADDER = """
     compilation distributed
     config checkpoint run_directory
     rotations robot
-    nodes kinematics trace packets
+    nodes kinematics statics trace packets
     planner terrain sampling feasibility rows
     footsteps footholds tasks scripts steering plans disturbances
     control observation symmetry rewards swings metrics verdicts charts
@@ -30,7 +30,7 @@ LADDER = """
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.
 DEPLOYMENT = (
-    "rotations nodes kinematics planner terrain feasibility rows footsteps control observation symmetry policy"
+    "rotations nodes kinematics statics planner terrain feasibility rows footsteps control observation symmetry policy"
     " packets follower robot config checkpoint"
 ).split()
 ABSENT = ("jax", "flax", "brax", "optax", "mujoco")
