@@ -96,8 +96,6 @@ def integrate(
       velocities: (12,) of the joints, rad/s.
       rests: () bool, whether the command stands still.
     """
-    if not settings.integral:
-        return state
     xp = namespace(a_ff)
     grown = state.integral + settings.integral * robot.timestep * (a_ff - normalize(robot, joints))
     at_rest = xp.all(xp.abs(velocities) < INTEGRAL_SPEED)
@@ -139,7 +137,7 @@ def respond(
     joints: Array,
     velocities: Array,
 ) -> tuple[Array, ControlState]:
-    """The whole law of a control step: `integrate`, the load of the commanded posture, `joint_targets`.
+    """The whole law of a control step: `integrate` and the load of the commanded posture if asked for, `joint_targets`.
 
     Args:
       state: after the last control step.
@@ -147,7 +145,8 @@ def respond(
       command: of this instant.
       joints, velocities: (12,) measured, rad and rad/s.
     """
-    state = integrate(robot, settings, state, a_ff, joints, velocities, stationary(command.rates))
+    if settings.integral:
+        state = integrate(robot, settings, state, a_ff, joints, velocities, stationary(command.rates))
     load = None
     if settings.gravity_feedforward:
         posture = denormalize(robot, a_ff)

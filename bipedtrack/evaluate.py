@@ -10,7 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from bipedtrack import checkpoint, config, control, footsteps, metrics, policy, robot, sampling, scripts, trace, versions
+from bipedtrack import (
+    checkpoint,
+    config,
+    control,
+    footsteps,
+    metrics,
+    policy,
+    robot,
+    sampling,
+    scripts,
+    statics,
+    trace,
+    versions,
+)
 from bipedtrack.disturbances import LADDERS, UNDISTURBED, Hooks
 from bipedtrack.messages import fail, quiet_imports
 from bipedtrack.swings import Boxes
@@ -20,7 +33,6 @@ if TYPE_CHECKING:
 
 SEED = 2024
 ENGINES = ("mjx", "mujoco", "converged")
-_GRAVITY = 9.81  # m/s^2
 _TRACES = 2  # episodes of each task whose traces are written
 
 
@@ -161,7 +173,7 @@ def run(options: Evaluate) -> dict[str, Any]:
     }
     for number, one in enumerate(who):
         engines = Engines(one, options.engine)
-        weight = float(_GRAVITY * robot.build_model(one.robot.name).body_mass.sum())
+        weight = float(statics.GRAVITY * robot.build_model(one.robot.name).body_mass.sum())
         stem = f"{number}-{pathlib.Path(one.name).stem}"  # two policies may have the same file name
         for name in wanted:
             batch, seconds = _batch(name, options, one.robot)

@@ -35,8 +35,8 @@ def by_kind(
     """A row for every kind that the curriculum has, and for hold if it has that.
 
     Args:
-      config: the curriculum, for ranges, kinds, episode length and control law.
-      trained: the policy; None is inverse kinematics alone.
+      config: the curriculum, for ranges, kinds and episode length.
+      trained: the policy, with its control law; None is inverse kinematics alone, with the curriculum's.
       difficulty: of the ranges, in [0, 1].
       episodes: for each row.
       seed: of the episodes; the same seed gives the same episodes to every policy.

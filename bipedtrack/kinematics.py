@@ -104,7 +104,7 @@ def centre_of_mass(robot: Robot, joints: Array) -> Array:
         sine, cosine = xp.sin(pitch), xp.cos(pitch)
         x, z = x + mass * (at_x - float(centre) * sine), z + mass * (at_z - float(centre) * cosine)
         at_x, at_z = at_x - length * sine, at_z - length * cosine
-    legs = sum(masses) * xp.asarray(robot.hips, dtype=joints.dtype) + _turn_hips(q, x, z)
+    legs = sum(masses) * xp.asarray(robot.hips, dtype=joints.dtype) + turn_hips(q, x, xp.zeros_like(x), z)
     return legs.sum(axis=0) / (trunk_mass + 2 * sum(masses))
 
 
@@ -126,12 +126,12 @@ def balanced(robot: Robot, nodes: Nodes, centre: Array) -> Nodes:
     return nodes._replace(trunk_position=nodes.trunk_position + move)
 
 
-def _turn_hips(q: Array, x: Array, z: Array) -> Array:
-    """Rz(hip yaw) Rx(hip roll) applied to (x, 0, z) of both legs, (2, 3); q (2, 6) rad, x and z (2,)."""
+def turn_hips(q: Array, x: Array, y: Array, z: Array) -> Array:
+    """Rz(hip yaw) Rx(hip roll) applied to (x, y, z) of both legs, (2, 3); q (2, 6) rad, x, y and z (2,)."""
     xp = namespace(q)
     s0, c0, s1, c1 = xp.sin(q[:, 0]), xp.cos(q[:, 0]), xp.sin(q[:, 1]), xp.cos(q[:, 1])
-    y = -s1 * z
-    return xp.stack([c0 * x - s0 * y, s0 * x + c0 * y, c1 * z], axis=-1)
+    y, z = c1 * y - s1 * z, s1 * y + c1 * z
+    return xp.stack([c0 * x - s0 * y, s0 * x + c0 * y, z], axis=-1)
 
 
 def forward(robot: Robot, joints: Array) -> tuple[Array, Array]:
@@ -142,8 +142,8 @@ def forward(robot: Robot, joints: Array) -> tuple[Array, Array]:
     x = -robot.thigh * xp.sin(q[:, 2]) - robot.shank * xp.sin(pitch)
     z = -robot.thigh * xp.cos(q[:, 2]) - robot.shank * xp.cos(pitch)
     pitch = pitch + q[:, 4]
-    headings = _turn_hips(q, xp.cos(pitch), -xp.sin(pitch))
-    return xp.asarray(robot.hips, dtype=joints.dtype) + _turn_hips(q, x, z), headings
+    headings = turn_hips(q, xp.cos(pitch), xp.zeros_like(pitch), -xp.sin(pitch))
+    return xp.asarray(robot.hips, dtype=joints.dtype) + turn_hips(q, x, xp.zeros_like(x), z), headings
 
 
 def level_feet(robot: Robot, joints: Array, trunk_orientation: Array) -> Array:

@@ -7,7 +7,7 @@ from the trunk frame F_B into one whose z axis is the vertical. The namespace fo
 
 from __future__ import annotations
 
-from bipedtrack import rotations
+from bipedtrack import kinematics, rotations
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
@@ -34,9 +34,7 @@ def load(robot: Robot, joints: Array, trunk_orientation: Array, stands: Array) -
 
     def level(x: Array, y: Array, z: Array) -> Array:
         """Vectors (2, 3) of the frames that hip yaw and hip roll have turned."""
-        s0, c0, s1, c1 = xp.sin(q[:, 0]), xp.cos(q[:, 0]), xp.sin(q[:, 1]), xp.cos(q[:, 1])
-        y, z = c1 * y - s1 * z, s1 * y + c1 * z
-        return xp.stack([c0 * x - s0 * y, s0 * x + c0 * y, z], axis=-1) @ to_level
+        return kinematics.turn_hips(q, x, y, z) @ to_level
 
     def down(thigh: float, shin: float) -> Array:
         """From the hips along the leg: m of the thigh and of the shank."""
