@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 from brax.training.agents.ppo import losses
 from brax.training.agents.ppo import train as ppo
 
+Term = Callable[[jax.Array, jax.Array], jax.Array]  # observations and mean actions, (robots, steps, ...), to a loss ()
+
 
 @contextlib.contextmanager
-def adapted_brax() -> Iterator[None]:
-    """Brax's `ppo.train` with an epoch that compiles once and that JAX can keep on disk.
+def adapted_brax(term: Term | None = None) -> Iterator[None]:
+    """Brax's `ppo.train` with an epoch that compiles once and that JAX can keep on disk, and a term more in its loss.
 
     - `jax.device_put_replicated`, which brax calls for the first training state, differs from `jax.pmap`, whose output all
       later ones are, in nothing but the name of the mesh's axis; that name is part of what JAX compares, and the epoch
@@ -23,7 +26,8 @@ def adapted_brax() -> Iterator[None]:
     - Where several processes train, what `jax.pmap` returns clings to the others' devices, and brax's mean of it fails.
     """
     original = jax.device_put_replicated, losses.compute_ppo_loss, jax.pmap
-    jax.device_put_replicated, losses.compute_ppo_loss = _replicate, _loss_and_episodes(losses.compute_ppo_loss)
+    compute_loss = losses.compute_ppo_loss if term is None else _with_term(losses.compute_ppo_loss, term)
+    jax.device_put_replicated, losses.compute_ppo_loss = _replicate, _loss_and_episodes(compute_loss)
     if jax.process_count() > 1:
         jax.pmap = _local(jax.pmap)
     try:
@@ -50,6 +54,25 @@ def _local(pmap: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *inputs: jax.tree.map(own, function(*inputs))
 
     return mapped
+
+
+def _with_term(compute_loss: Callable[..., Any], term: Term) -> Callable[..., Any]:
+    """The loss and a term of the mean actions, which are those that brax computes for its own loss: once is enough."""
+
+    def loss(params: Any, normalizer_params: Any, data: Any, rng: Any, *, ppo_network: Any, **settings: Any) -> Any:
+        seen = []
+
+        def apply(*inputs: Any) -> Any:
+            seen.append(ppo_network.policy_network.apply(*inputs))
+            return seen[-1]
+
+        policy_network = dataclasses.replace(ppo_network.policy_network, apply=apply)
+        watched = dataclasses.replace(ppo_network, policy_network=policy_network)
+        total, metrics = compute_loss(params, normalizer_params, data, rng, ppo_network=watched, **settings)
+        ((means, _),) = seen
+        return total + term(data.observation, means.swapaxes(0, 1)), metrics  # brax has time first
+
+    return loss
 
 
 def _loss_and_episodes(compute_loss: Callable[..., Any]) -> Callable[..., Any]:

@@ -112,6 +112,7 @@ class Stage:
     scripts: tuple[str, ...] = ()  # footstep scripts that episodes follow too: names in curricula/footsteps, or files
     script_share: float = 0.0  # share of the episodes that follow one of them
     retries: int = 0  # how many times an episode that ends in a fall begins again from a second or two before it
+    feedback_error: float = 0.0  # weight of feedback-error learning in the loss (`feedback_error.loss`)
     rewards: RewardConfig | None = None  # where they are others than the curriculum's; in TOML: what differs is enough
     ranges: Ranges | None = None  # the same; evaluations keep to the curriculum's
     control: ControlConfig | None = None  # the same; a policy keeps to that of the stage it comes from
@@ -119,8 +120,8 @@ class Stage:
     def __post_init__(self) -> None:
         if not self.lessons:
             raise ValueError(f"stage {self.name!r} has no lessons")
-        if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon) < 0:
-            raise ValueError("learning_rate, entropy_cost and clipping_epsilon must not be negative")
+        if min(*self.learning_rate, *self.entropy_cost, *self.clipping_epsilon, self.feedback_error) < 0:
+            raise ValueError("learning_rate, entropy_cost, clipping_epsilon and feedback_error must not be negative")
         for name in ("hold_share", "mix_share", "break_share", "script_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")

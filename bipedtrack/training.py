@@ -24,6 +24,7 @@ from bipedtrack import (
     curriculum,
     distributed,
     env,
+    feedback_error,
     networks,
     plans,
     policy,
@@ -32,7 +33,7 @@ from bipedtrack import (
     tasks,
     versions,
 )
-from bipedtrack.adapted_brax import adapted_brax
+from bipedtrack.adapted_brax import Term, adapted_brax
 from bipedtrack.checkpoint import Checkpoint, CheckpointError
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.networks import Params
@@ -134,7 +135,7 @@ def _run_call(
 
     look_back = round(_LOOK_BACK / config.policy_period)
     progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
-    with adapted_brax():
+    with adapted_brax(_term(the_env.robot, call.stage.feedback_error)):
         _, params, _ = ppo.train(
             environment=autoreset.AutoReset(the_env, config.episode_length, call.stage.retries, look_back),
             num_timesteps=updates * ppo_config.steps_per_update,
@@ -147,6 +148,11 @@ def _run_call(
             **ppo_arguments(config, call),
         )
     return params
+
+
+def _term(the_robot: robot.Robot, weight: float) -> Term | None:
+    """What a stage adds to PPO's loss."""
+    return (lambda *batch: weight * feedback_error.loss(the_robot, *batch)) if weight else None
 
 
 def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[str, Any]:

@@ -190,6 +190,11 @@ CHANGED = [  # what stands there, what shall stand there, and the line it gives
     ("[4e-4, 1e-4]", "4e-4", "stages[0].learning_rate: 0.0004 (float) does not fit; wanted a list of 2"),
     ("[4e-4, 1e-4]", '["4e-4", 0]', "stages[0].learning_rate[0]: '4e-4' (string) does not fit; wanted a finite number"),
     ("hold_share = 0.5", "hold_share = 1.5", "stages[1]: hold_share must lie in [0, 1], not 1.5"),
+    (
+        "hold_share = 0.5",
+        "feedback_error = -1",
+        "stages[1]: learning_rate, entropy_cost, clipping_epsilon and feedback_error must",
+    ),
     ("hold_share = 0.5", "retries = -1", "stages[1]: retries must not be negative, not -1"),
     (
         "hold_share = 0.5",

@@ -1,0 +1,36 @@
+"""Feedback-error learning: a joint that stands off its feedforward says which feedback would put it there. Not in the paper.
+
+After Kawato, Furukawa and Suzuki, "A hierarchical neural-network model for control and learning of voluntary movement",
+Biological Cybernetics 57 (1987): what a feedback controller has to do teaches the feedforward one. Here the errors that PD
+controllers are left with, in legs that carry the robot, teach the network beside PPO. PPO itself is slow to remove an error
+that is the same for seconds: exploration is white noise, which filter, PD and the body's weight even out, and an update
+moves the mean action by less than its deviation.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from bipedtrack import control, observation
+from bipedtrack.robot import Robot
+
+LARGEST = 0.05  # of an error that is followed, in half ranges of the joint: beyond, the robot does not stand still
+
+
+def loss(robot: Robot, observations: jax.Array, actions: jax.Array) -> jax.Array:
+    """A term () of the learner's loss: descending it moves the mean actions by the joints' errors.
+
+    In unrolls in which both feet are to stand from the first step to the last, the error of a joint is its feedforward less
+    its angle, averaged over the unroll: what a single step adds to it is noise, or balance.
+
+    Args:
+      robot: whose joints they are.
+      observations: (robots, steps, 101) unrolls.
+      actions: (robots, steps, 12) the network's mean outputs for them.
+    """
+    parts = {name: observations[..., part] for name, part in observation.layout().items()}
+    error = (parts["feedforward"] - control.normalize(robot, parts["joint_positions"])).mean(axis=1, keepdims=True)
+    stands = (parts["timer"] <= 0).all(axis=(1, 2))[:, None, None]
+    signal = jnp.where(stands, jnp.clip(error, -LARGEST, LARGEST), 0.0)
+    return -(jax.lax.stop_gradient(signal) * actions).sum(axis=-1).mean()
