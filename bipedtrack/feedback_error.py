@@ -11,21 +11,22 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from bipedtrack import control, observation
+from bipedtrack import control, observation, rewards
 from bipedtrack.robot import Robot
 
 LARGEST = 0.02  # of an error that is followed, in half ranges of the joint: what is greater, balance may ask for
-_PITCH = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0] * 2, np.float32)  # hip pitch, knee and ankle pitch of both legs
+SLOW = (
+    0.1  # m/s by which the trunk may be faster or slower than it should, on average over an unroll: else it is not settled
+)
 
 
 def loss(robot: Robot, observations: jax.Array, actions: jax.Array) -> jax.Array:
-    """A term () of the learner's loss: descending it moves the mean actions by the errors of the joints of standing legs.
+    """A term () of the learner's loss: descending it moves the mean actions by the errors of the joints.
 
-    The error of a joint is its feedforward less its angle, averaged over those steps of an unroll in which its leg stands:
-    what a single step adds to it is noise, or balance. While the robot steps, pitch joints alone count: the sway to the
-    sides, to which the others yield, is the gait's own.
+    It counts unrolls in which both feet are to stand from the first step to the last and the trunk moves as it should:
+    standing, squatting, holding still. The error of a joint is its feedforward less its angle, averaged over the unroll:
+    what a single step adds to it is noise, or balance.
 
     Args:
       robot: whose joints they are.
@@ -33,10 +34,8 @@ def loss(robot: Robot, observations: jax.Array, actions: jax.Array) -> jax.Array
       actions: (robots, steps, 12) the network's mean outputs for them.
     """
     parts = {name: observations[..., part] for name, part in observation.layout().items()}
-    legs = (parts["timer"] <= 0).astype(observations.dtype)
-    standing = jnp.repeat(legs, 6, axis=-1)
-    error = parts["feedforward"] - control.normalize(robot, parts["joint_positions"])
-    error = (standing * error).sum(axis=1, keepdims=True) / jnp.maximum(standing.sum(axis=1, keepdims=True), 1.0)
-    counts = standing * jnp.where(legs.min(axis=(1, 2), keepdims=True) > 0, 1.0, _PITCH)
-    signal = jax.lax.stop_gradient(counts * jnp.clip(error, -LARGEST, LARGEST))
-    return -(signal * actions).sum(axis=-1).mean()
+    error = (parts["feedforward"] - control.normalize(robot, parts["joint_positions"])).mean(axis=1, keepdims=True)
+    stands = (parts["timer"] <= 0).all(axis=(1, 2))
+    settled = rewards.norm(parts["trunk_velocity"] - parts["trunk_velocity_target"]).mean(axis=1) < SLOW
+    signal = jnp.where((stands & settled)[:, None, None], jnp.clip(error, -LARGEST, LARGEST), 0.0)
+    return -(jax.lax.stop_gradient(signal) * actions).sum(axis=-1).mean()
