@@ -16,9 +16,7 @@ from bipedtrack import control, observation, rewards
 from bipedtrack.robot import Robot
 
 LARGEST = 0.02  # of an error that is followed, in half ranges of the joint: what is greater, balance may ask for
-SLOW = (
-    0.1  # m/s by which the trunk may be faster or slower than it should, on average over an unroll: else it is not settled
-)
+SLOW = 0.1  # m/s, on average over an unroll, by which the velocity of a settled trunk may be off
 
 
 def loss(robot: Robot, observations: jax.Array, actions: jax.Array) -> jax.Array:
