@@ -1,4 +1,4 @@
-"""Brax's PPO as it is while we call it: how often it compiles, what it reports, whether its program is kept."""
+"""Brax's PPO as it is while we call it: how often it compiles, what it reports and descends, whether its program is kept."""
 
 import functools
 import pathlib

@@ -17,7 +17,7 @@ PARTS = observation.layout()
 
 
 def unrolls(robot: Robot, errors: np.ndarray, timers: np.ndarray) -> np.ndarray:
-    """Observations (robots, steps, 101) of joints that are errors (robots, steps, 12), half ranges, off one of 0.3."""
+    """Observations (robots, steps, 101) whose joints are `errors`, (robots, steps, 12) half ranges, short of 0.3."""
     flat = np.random.default_rng(1).normal(size=(*errors.shape[:2], observation.SIZE)).astype(np.float32)
     flat[..., PARTS["feedforward"]] = 0.3
     flat[..., PARTS["joint_positions"]] = robot.joint_middle + robot.joint_half_range * (0.3 - errors)
