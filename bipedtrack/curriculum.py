@@ -29,6 +29,7 @@ class NetworkConfig:
     initial_noise: float = 0.7  # standard deviation of the Gaussian over the network's output
     normalizer_floor: float = 0.05  # added to the variance of every observation, which may be constant at first
     symmetric: bool = False  # shown the mirror image where the right foot leads: half as much to learn (`symmetry`)
+    critic_sees_balance: bool = False  # also where the centre of mass is going, seen from the feet (`balance`)
 
     def __post_init__(self) -> None:
         if min(self.actor, default=0) < 1 or min(self.critic, default=0) < 1:

@@ -9,12 +9,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.training import networks as brax_networks
+from brax.training import types
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import linen
 
-from bipedtrack import curriculum, observation, policy, robot, symmetry
+from bipedtrack import balance, curriculum, observation, policy, robot, symmetry
 from bipedtrack.checkpoint import CheckpointError
+from bipedtrack.robot import Robot
 
 _ACTIVATIONS = {"swish": linen.swish, "tanh": linen.tanh, "relu": linen.relu}
 assert set(_ACTIVATIONS) == set(policy.ACTIVATIONS)
@@ -22,8 +25,13 @@ assert set(_ACTIVATIONS) == set(policy.ACTIVATIONS)
 Params = Any  # brax's (normaliser state, policy parameters, value parameters)
 
 
-def make(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> ppo_networks.PPONetworks:
-    """Brax's actor and critic, as a `network_factory`: Gaussian actions whose deviation is learned, not squashed."""
+def make(
+    network: curriculum.NetworkConfig, *args: Any, the_robot: Robot | None = None, **kwargs: Any
+) -> ppo_networks.PPONetworks:
+    """Brax's actor and critic, as a `network_factory`: Gaussian actions whose deviation is learned, not squashed.
+
+    `the_robot` is the one whose balance the critic sees, if it does.
+    """
     made = ppo_networks.make_ppo_networks(
         *args,
         **kwargs,
@@ -34,7 +42,31 @@ def make(network: curriculum.NetworkConfig, *args: Any, **kwargs: Any) -> ppo_ne
         noise_std_type="log",
         init_noise_std=network.initial_noise,
     )
+    if network.critic_sees_balance:
+        assert the_robot is not None
+        made = dataclasses.replace(made, value_network=_balance_critic(network, the_robot, *args, **kwargs))
     return _symmetric(made) if network.symmetric else made
+
+
+def _balance_critic(
+    network: curriculum.NetworkConfig,
+    the_robot: Robot,
+    observation_size: Any,
+    _: int,
+    preprocess_observations_fn: Any = types.identity_observation_preprocessor,
+) -> brax_networks.FeedForwardNetwork:
+    """Brax's critic, shown the robot's balance beside the normalised observation."""
+
+    def shown(flat: jax.Array, normalizer: Any) -> jax.Array:
+        return jnp.concatenate([preprocess_observations_fn(flat, normalizer), balance.features(the_robot, flat)], axis=-1)
+
+    (size,) = np.atleast_1d(observation_size)
+    return brax_networks.make_value_network(
+        int(size) + balance.SIZE,
+        preprocess_observations_fn=shown,
+        hidden_layer_sizes=network.critic,
+        activation=_ACTIVATIONS[network.activation],
+    )
 
 
 def _symmetric(made: ppo_networks.PPONetworks) -> ppo_networks.PPONetworks:
@@ -66,7 +98,8 @@ def template(config: curriculum.Curriculum) -> Params:
     """Shapes and types of the parameters, without computing any."""
 
     def build() -> Params:
-        made = make(config.network, observation.SIZE, len(robot.load(config.robot).joint_names))
+        the_robot = robot.load(config.robot)
+        made = make(config.network, observation.SIZE, len(the_robot.joint_names), the_robot=the_robot)
         key = jax.random.PRNGKey(0)
         normalizer = running_statistics.init_state(
             specs.Array((observation.SIZE,), np.dtype("float32")), std_eps=config.network.normalizer_floor

@@ -178,7 +178,7 @@ def ppo_arguments(config: curriculum.Curriculum, call: curriculum.Call) -> dict[
         "reward_scaling": ppo_config.reward_scaling,
         "normalize_observations": True,
         "normalize_observations_std_eps": network.normalizer_floor,
-        "network_factory": functools.partial(networks.make, network),
+        "network_factory": functools.partial(networks.make, network, the_robot=robot.load(config.robot)),
     }
 
 

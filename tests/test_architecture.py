@@ -21,7 +21,7 @@ LADDER = """
     nodes kinematics statics trace packets
     planner terrain sampling feasibility rows
     footsteps footholds tasks scripts steering plans disturbances
-    control observation symmetry rewards feedback_error swings metrics verdicts charts
+    control observation symmetry rewards feedback_error balance swings metrics verdicts charts
     policy follower onnx_export env autoreset
     curriculum adapted_brax networks rollout progress recording suite pictures
     training evaluation sheets comparisons report
