@@ -1,7 +1,7 @@
 """Where a robot's centre of mass is going, as seen from its feet, for the critic of PPO. Not in the paper.
 
-Whether a robot can still be stopped is decided within a centimetre or two of its soles' edges. That distance follows from an
-observation, but from thirty of its numbers at once, and a small network sees it as through frosted glass.
+Whether a robot can still be stopped is decided within a centimetre or two of its soles' edges. Where it is follows from an
+observation, but from thirty of its numbers at once, more finely than a small network resolves them (notebook 48).
 """
 
 from __future__ import annotations
