@@ -2,8 +2,8 @@
 
 After Kawato, Furukawa and Suzuki, "A hierarchical neural-network model for control and learning of voluntary movement",
 Biological Cybernetics 57 (1987): what a feedback controller has to do teaches the feedforward one. Here the errors that PD
-controllers are left with while the robot stands or squats teach the network beside PPO. PPO itself is slow to remove an
-error that is the same for seconds: exploration is white noise, which filter, PD and the body's weight even out, and an
+controllers are left with while the robot stands or squats slowly teach the network beside PPO. PPO itself is slow to remove
+an error that is the same for seconds: exploration is white noise, which filter, PD and the body's weight even out, and an
 update moves the mean action by less than its deviation.
 """
 

@@ -44,25 +44,21 @@ def make(
     )
     if network.critic_sees_balance:
         assert the_robot is not None
-        made = dataclasses.replace(made, value_network=_balance_critic(network, the_robot, *args, **kwargs))
+        normalize = kwargs.get("preprocess_observations_fn", types.identity_observation_preprocessor)
+        made = dataclasses.replace(made, value_network=_balance_critic(network, the_robot, normalize))
     return _symmetric(made) if network.symmetric else made
 
 
 def _balance_critic(
-    network: curriculum.NetworkConfig,
-    the_robot: Robot,
-    observation_size: Any,
-    _: int,
-    preprocess_observations_fn: Any = types.identity_observation_preprocessor,
+    network: curriculum.NetworkConfig, the_robot: Robot, normalize: types.PreprocessObservationFn
 ) -> brax_networks.FeedForwardNetwork:
     """Brax's critic, shown the robot's balance beside the normalised observation."""
 
     def shown(flat: jax.Array, normalizer: Any) -> jax.Array:
-        return jnp.concatenate([preprocess_observations_fn(flat, normalizer), balance.features(the_robot, flat)], axis=-1)
+        return jnp.concatenate([normalize(flat, normalizer), balance.features(the_robot, flat)], axis=-1)
 
-    (size,) = np.atleast_1d(observation_size)
     return brax_networks.make_value_network(
-        int(size) + balance.SIZE,
+        observation.SIZE + balance.SIZE,
         preprocess_observations_fn=shown,
         hidden_layer_sizes=network.critic,
         activation=_ACTIVATIONS[network.activation],
