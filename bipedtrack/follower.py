@@ -223,6 +223,8 @@ class Follower:
             lift=np.zeros(2),
             trigonometric=np.float64(0),
             ease=np.float64(0),
+            pivot=np.zeros(2),
+            pendulum=np.float64(0),
         )
 
 

@@ -20,6 +20,8 @@ defaults. What the cells mean and what empty ones do:
     trunk_roll, trunk_pitch  orientation is Rz(yaw) Ry(pitch) Rx(roll); empty: 0, level
     trunk_yaw                empty: the mean of the feet's yaws
 
+While one foot steps, the trunk sways over the other one on its way (planner.TaskStep.pendulum).
+
 With `both`, x, y, z, yaw and lift stay empty and the period is how long the trunk takes. A foot that is up needs its z, and
 the other one can not step until it is down again. A line with nothing but `both` and perhaps a period holds: every target
 stays where it is. So does everything after the last line. A yaw counts modulo a whole turn; feet and trunk turn the shorter
@@ -41,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bipedtrack import feasibility, kinematics, planner, rotations, rows
+from bipedtrack import feasibility, kinematics, planner, rotations, rows, statics
 from bipedtrack.messages import Refusal
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.planner import Command, TaskStep
@@ -195,6 +197,7 @@ def task_step(
     end = start if holds else _over_feet(robot, boxes, start, ankles, yaws, values)
     swing = np.array([float(foot in feet) for foot in range(len(LEGS))])
     lift = swing * given("lift", LIFT)
+    pivot, frequency = statics.pendulum(robot, end, int(np.argmin(swing)))
     return TaskStep(
         start=start,
         end=end,
@@ -204,6 +207,8 @@ def task_step(
         lift=lift,
         trigonometric=np.float64(0),
         ease=np.float64(EASE),
+        pivot=pivot,
+        pendulum=np.float64(frequency if len(feet) == 1 else 0),
     )
 
 

@@ -6,6 +6,10 @@ writes its control points plans the motion.
 
 A Bezier curve that is run through uniformly leaves the ground at up to 4 m/s, which no foot at rest can follow; `ease`
 lets it gather speed first. The paper says nothing of it; 0 is uniform.
+
+A trunk that moves uniformly midway between two feet of which one alone carries it is what no robot can do: it would have
+to be pushed from where nothing stands. `pendulum` lets it sway over the stance foot as its weight makes it do (Kajita et
+al., "The 3D linear inverted pendulum mode", IROS 2001). Not in the paper; 0 is uniform.
 """
 
 from __future__ import annotations
@@ -16,6 +20,8 @@ from typing import NamedTuple
 from bipedtrack import rotations
 from bipedtrack.nodes import NodeRates, Nodes
 from bipedtrack.rotations import Array, namespace
+
+_LONG_AGO = 60.0  # time constants: nothing of a pendulum's start is left
 
 
 class TaskStep(NamedTuple):
@@ -29,6 +35,8 @@ class TaskStep(NamedTuple):
     lift: Array  # (2,) m, height of a trigonometric curve above its chord
     trigonometric: Array  # () 1: ankles follow trigonometric curves, 0: Bezier curves
     ease: Array  # () share of the period in which Bezier curves gather speed from rest, and brake to rest; below 0.5
+    pivot: Array  # (2,) m, where the trunk would balance on the stance foot
+    pendulum: Array  # () 1/s, sqrt(g / height) of a trunk that sways about the pivot; 0: it moves uniformly
 
 
 class Command(NamedTuple):
@@ -77,6 +85,30 @@ def eased(share: Array, ease: Array) -> tuple[Array, Array]:
     return xp.where(share < 0.5, way, 1 - way), xp.where(ease > 0, speed, xp.ones_like(share))
 
 
+def swayed(step: TaskStep, time: Array) -> tuple[Array, Array]:
+    """Where a trunk is that falls away from the pivot as a linear inverted pendulum, (2,) m, and its velocity, (2,) m/s.
+
+    At the start at time 0 and at the end at time T: (x(0) sinh(w (T - t)) + x(T) sinh(w t)) / sinh(w T) from the pivot,
+    w the pendulum's frequency. time: () s within the period.
+    """
+    xp = namespace(step.period)
+    period = step.period
+    w = xp.where(step.pendulum > 0, step.pendulum, xp.ones_like(step.pendulum))
+
+    def decayed(seconds: Array) -> Array:
+        return xp.exp(-xp.minimum(w * seconds, xp.full_like(period, _LONG_AGO)))
+
+    def share(gone: Array) -> tuple[Array, Array]:
+        """sinh(w (T - gone)) / sinh(w T), which no long period lets overflow, and how fast it falls."""
+        near, far, whole = decayed(gone), decayed(2 * period - gone), 1 - decayed(2 * period)
+        return (near - far) / whole, w * (near + far) / whole
+
+    of_start, loss = share(time)
+    of_end, gain = share(period - time)
+    start, end = (nodes.trunk_position[:2] - step.pivot for nodes in (step.start, step.end))
+    return step.pivot + of_start * start + of_end * end, gain * end - loss * start
+
+
 def command(step: TaskStep, time: Array) -> Command:
     """The command at `time` seconds, (), into the step; from the period on its end stands still (rates and T are zero)."""
     xp = namespace(step.period)
@@ -95,16 +127,20 @@ def command(step: TaskStep, time: Array) -> Command:
     turn = rotations.to_rotation_vector(turn)  # constant axis: the same in both trunk frames
     orientation = rotations.multiply(start.trunk_orientation, rotations.from_rotation_vector(s * turn))
     travel = end.trunk_position - start.trunk_position
+    sways = step.pendulum > 0
+    place, velocity = swayed(step, s * step.period)
+    place = xp.where(sways, place, start.trunk_position[:2] + s * travel[:2])
+    velocity = xp.where(sways, running * velocity, per_second * travel[:2])
     yaw_travel = rotations.wrap(end.ankle_yaws - start.ankle_yaws)
 
     target = Nodes(
-        trunk_position=start.trunk_position + s * travel,
+        trunk_position=xp.concat([place, start.trunk_position[2:] + s * travel[2:]]),
         trunk_orientation=orientation,
         ankle_positions=ankles,
         ankle_yaws=start.ankle_yaws + (s * s * (3 - 2 * s)) * yaw_travel,
     )
     rates = NodeRates(
-        trunk_velocity=per_second * travel,
+        trunk_velocity=xp.concat([velocity, per_second * travel[2:]]),
         trunk_angular_velocity=rotations.to_matrix(start.trunk_orientation) @ (per_second * turn),
         ankle_velocities=per_second * ankle_rates,
         ankle_yaw_rates=(per_second * 6 * s * (1 - s)) * yaw_travel,

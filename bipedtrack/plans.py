@@ -50,6 +50,7 @@ def script_plan(script: footsteps.Script) -> Plan:
         swing=np.zeros(2),
         lift=np.zeros(2),
         ankle_points=np.repeat(last.end.ankle_positions[:, None], last.ankle_points.shape[1], axis=1),
+        pendulum=np.float64(0),
     )
     boxes = np.array([np.concatenate([box.position, box.orientation]) for box in script.boxes]).reshape(-1, 7)
     steps = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *script.steps, hold)
@@ -119,6 +120,7 @@ def mirrored(plan: Plan) -> Plan:
             swing=steps.swing[..., ::-1],
             lift=steps.lift[..., ::-1],
             ankle_points=steps.ankle_points[..., ::-1, :, :] * [1, -1, 1],
+            pivot=steps.pivot * [1, -1],
         )
     )
 

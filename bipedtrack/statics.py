@@ -8,10 +8,29 @@ from the trunk frame F_B into one whose z axis is the vertical. The namespace fo
 from __future__ import annotations
 
 from bipedtrack import kinematics, rotations
+from bipedtrack.nodes import Nodes
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
 GRAVITY = 9.81  # m/s^2
+_LOWEST = 0.1  # m: no centre of mass is lower over the feet, but of what cannot be
+
+
+def pendulum(robot: Robot, nodes: Nodes, foot: Array) -> tuple[Array, Array]:
+    """Where the trunk balances on one foot, (2,) m, and its frequency there as a linear inverted pendulum, () 1/s.
+
+    The centre of mass balances over the ankle, the middle of the foot, and the trunk is as far from it as in `nodes`.
+
+    Args:
+      robot: its constants.
+      nodes: a posture.
+      foot: () the index of the stance foot.
+    """
+    xp = namespace(nodes.trunk_position)
+    mass = kinematics.centre_of_mass_at(robot, nodes)
+    height = mass[2] - nodes.ankle_positions[:, 2].mean() + robot.ankle_height
+    frequency = xp.sqrt(GRAVITY / xp.maximum(height, xp.full_like(height, _LOWEST)))
+    return nodes.ankle_positions[foot, :2] + nodes.trunk_position[:2] - mass[:2], frequency
 
 
 def load(robot: Robot, joints: Array, trunk_orientation: Array, stands: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bipedtrack import kinematics, nodes, planner, rotations, terrain
+from bipedtrack import kinematics, nodes, planner, rotations, statics, terrain
 from bipedtrack.footholds import FOOT_DISTANCE
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
@@ -37,6 +37,7 @@ class Motion(NamedTuple):
     period: Array  # () s
     lift: Array  # () m
     trunk_height: Array  # () m
+    sway: Array  # () in [0, 1], planner.TaskStep.pendulum as a share of statics.pendulum
 
 
 class Task(NamedTuple):
@@ -96,7 +97,7 @@ def _motion(key: Array, given: Distribution, level: bool) -> tuple[Motion, dict[
     draw = sample(
         key_motion,
         ("period", "walk_step", "sidle_step", "turn_yaw", "turn_radius", "stair_riser", "stair_tread", "lift")
-        + ("trunk_height", "stair_trunk_height", "foot_x", "foot_distance", "foot_yaw"),
+        + ("trunk_height", "stair_trunk_height", "foot_x", "foot_distance", "foot_yaw", "sway"),
         given.ranges,
     )
     turn, radius = draw["turn_yaw"], draw["turn_radius"]
@@ -117,7 +118,8 @@ def _motion(key: Array, given: Distribution, level: bool) -> tuple[Motion, dict[
     # the leading foot of a sidle is the one on the side it goes to
     first = jnp.where(kind == SIDLE, (draw["sidle_step"] < 0).astype(jnp.int32), (u[1] < 0.5).astype(jnp.int32))
     height = _choose(kind == STAIRS, draw["stair_trunk_height"], draw["trunk_height"])
-    return Motion(kind, advances[kind], first, draw["period"], draw["lift"], height), draw
+    sway = jnp.clip(draw["sway"], 0.0, 1.0)
+    return Motion(kind, advances[kind], first, draw["period"], draw["lift"], height, sway), draw
 
 
 def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
@@ -244,6 +246,7 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
     swing = jnp.where(steps, (jnp.arange(2) == swings).astype(jnp.float32), 0.0)
     lift = swing * motion.lift * vary[1]
+    pivot, frequency = statics.pendulum(robot, end, 1 - swings)
     u = jax.random.uniform(key_curve, (2, 3))
     points = planner.swing_points(
         start.ankle_positions,
@@ -262,6 +265,8 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
         # a trigonometric curve rises above its chord, which passes through the tread between two others
         trigonometric=((draw["trigonometric"] > 0) & (motion.kind != STAIRS)).astype(jnp.float32),
         ease=draw["swing_ease"],
+        pivot=pivot,
+        pendulum=motion.sway * swing.max() * frequency,
     )
 
 

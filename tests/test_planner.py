@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation, Slerp
 
 from bipedtrack import planner
@@ -47,6 +48,8 @@ def random_step(random: np.random.Generator, trigonometric: float, order: int = 
         lift=swing * random.uniform(0.02, 0.2),
         trigonometric=np.asarray(trigonometric),
         ease=np.asarray(random.choice([0.0, random.uniform(0.01, 0.49)])),
+        pivot=random.uniform(-1, 1, 2),
+        pendulum=np.asarray(random.choice([0.0, random.uniform(2, 5)])),
     )
     return jax.tree.map(lambda x: np.asarray(x, dtype), step)
 
@@ -150,7 +153,7 @@ def test_target_leads_from_the_start_to_the_end(trigonometric: float, random: np
 
 @given(random=SEEDS, s=st.floats(0, 1))
 def test_trunk_moves_uniformly_and_turns_about_one_axis(random: np.random.Generator, s: float) -> None:
-    step = random_step(random, 0.0)
+    step = random_step(random, 0.0)._replace(pendulum=np.asarray(0.0))
     target = planner.command(step, s * step.period).target
     start, end = step.start, step.end
     assert target.trunk_position == pytest.approx((1 - s) * start.trunk_position + s * end.trunk_position)
@@ -158,6 +161,40 @@ def test_trunk_moves_uniformly_and_turns_about_one_axis(random: np.random.Genera
     expected = Slerp([0, 1], Rotation.from_quat(ends, scalar_first=True))(s)
     found = Rotation.from_quat(target.trunk_orientation, scalar_first=True)
     assert (found.inv() * expected).magnitude() == pytest.approx(0, abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_trunk_sways_as_a_linear_inverted_pendulum(seed: int) -> None:
+    """Integrated from its first position and velocity, x'' = w^2 (x - pivot) arrives at the end in the period."""
+    step = random_step(np.random.default_rng(seed), 0.0)._replace(pendulum=np.asarray(4.0))
+    times = np.linspace(0, float(step.period), 9)[:-1]
+    found = [planner.command(step, time) for time in times]
+    first = np.concatenate([step.start.trunk_position[:2], found[0].rates.trunk_velocity[:2]])
+
+    def fall(_: float, state: np.ndarray) -> np.ndarray:
+        return np.concatenate([state[2:], 16 * (state[:2] - step.pivot)])
+
+    span = 0, float(step.period)
+    expected = solve_ivp(fall, span, first, t_eval=[*times, span[1]], rtol=1e-10, atol=1e-12).y.T
+    assert expected[-1, :2] == pytest.approx(step.end.trunk_position[:2], abs=1e-7)
+    assert np.array([command.target.trunk_position[:2] for command in found]) == pytest.approx(expected[:-1, :2], abs=1e-7)
+    assert np.array([command.rates.trunk_velocity[:2] for command in found]) == pytest.approx(expected[:-1, 2:], abs=1e-6)
+    heights = [command.target.trunk_position[2] for command in found]
+    way = step.end.trunk_position[2] - step.start.trunk_position[2]
+    assert heights == pytest.approx(step.start.trunk_position[2] + times / span[1] * way)
+
+
+def test_sway_worked_by_hand() -> None:
+    """Stepping in place, feet 0.2 m apart: the trunk turns back 0.1 - 0.1 / cosh(w T / 2) from the middle."""
+    step = random_step(np.random.default_rng(0), 0.0)
+    start = step.start._replace(trunk_position=np.array([0.0, 0.0, 0.75]))
+    step = step._replace(
+        start=start, end=start, period=np.asarray(0.5), pivot=np.array([0.0, 0.1]), pendulum=np.asarray(4.0)
+    )
+    middle = planner.command(step, np.asarray(0.25))
+    assert middle.target.trunk_position == pytest.approx([0, 0.1 - 0.1 / math.cosh(1), 0.75])
+    assert middle.rates.trunk_velocity == pytest.approx(0, abs=1e-12)
+    assert planner.command(step, np.asarray(0.0)).rates.trunk_velocity[1] == pytest.approx(0.4 * math.tanh(1))
 
 
 @given(random=SEEDS)

@@ -192,9 +192,7 @@ def test_boxes_of_a_script_plan_worked_by_hand(robot: Robot) -> None:
 def of_periods(periods: np.ndarray) -> Plan:
     """A plan of which only the periods are known."""
     nowhere: Any = None
-    return Plan(
-        TaskStep(nowhere, nowhere, periods, nowhere, nowhere, nowhere, nowhere, nowhere), np.zeros((len(periods), 0, 7))
-    )
+    return Plan(TaskStep(nowhere, nowhere, periods, *[nowhere] * 7), np.zeros((len(periods), 0, 7)))
 
 
 @given(

@@ -84,3 +84,19 @@ def test_jax_gives_numpys_torques(robot: Robot) -> None:
     in_numpy = [statics.load(single, *given) for given in zip(joints, tilts, stands, strict=True)]
     assert in_jax.dtype == in_numpy[0].dtype == np.float32
     np.testing.assert_allclose(in_jax, in_numpy, atol=1e-3)
+
+
+@pytest.mark.parametrize("foot", [0, 1])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pendulum_balances_mujocos_centre_of_mass_over_the_foot(
+    robot: Robot, mj_model: mujoco.MjModel, seed: int, foot: int
+) -> None:
+    nodes = posture(robot, seed)
+    joints = control.denormalize(robot, control.feedforward(robot, ControlConfig(level_feet=False), nodes))
+    data = mujoco.MjData(mj_model)
+    data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, joints])
+    mujoco.mj_forward(mj_model, data)
+    pivot, frequency = statics.pendulum(robot, nodes, foot)
+    moved = data.subtree_com[0][:2] + pivot - nodes.trunk_position[:2]
+    assert moved == pytest.approx(nodes.ankle_positions[foot, :2], abs=3e-4)
+    assert frequency**2 * data.subtree_com[0][2] == pytest.approx(9.81, rel=1e-3)  # the soles are at height 0

@@ -86,6 +86,9 @@ def test_every_task_has_a_name_of_its_own() -> None:
         "stairs-breaks",
         "walk-forward-uniform",
         "stairs-up-uniform",
+        "walk-forward-straight",
+        "stairs-up-straight",
+        "stairs-down-straight",
         "hold-wander",
         "hold-60s-wander",
     }
@@ -408,3 +411,12 @@ def test_only_what_says_so_has_swings_that_are_run_through_uniformly(robot: Robo
     drawn = suite.batch(task, sampling.Ranges(), robot, 4, 2.0, 0)
     assert (drawn.plan.steps.ease >= ease - 1e-6).all() and (drawn.plan.steps.ease <= ease + 0.1 * (ease > 0) + 1e-6).all()
     assert ("uniformly" in drawn.ranges) == (ease == 0)
+
+
+@pytest.mark.parametrize(
+    ("task", "sways"), [("walk-forward", True), ("walk-forward-straight", False), ("stairs-down-straight", False)]
+)
+def test_only_what_says_so_has_a_trunk_that_moves_uniformly(robot: Robot, task: str, sways: bool) -> None:
+    drawn = suite.batch(task, sampling.Ranges(), robot, 4, 2.0, 0)
+    assert ((drawn.plan.steps.pendulum > 3) == sways).all()  # sqrt(g / 1 m) is 3.1 1/s
+    assert ("the trunk moves uniformly" in drawn.ranges) != sways

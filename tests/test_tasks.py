@@ -246,6 +246,36 @@ def test_trunk_stays_level_and_the_centre_of_mass_over_the_feet_at_the_episodes_
     assert np.exp(1j * heading(end.trunk_orientation)) == pytest.approx(np.exp(1j * yaw), abs=1e-5)
 
 
+@ALL_KINDS
+def test_the_trunk_sways_over_the_stance_foot_and_back(episodes: Callable, kind: str) -> None:
+    """By 0.1 m (1 - 1 / cosh(w T / 2)), 2-6 cm, from between feet 0.2 m apart; without a swing foot it moves uniformly."""
+    drawn = episodes(kind)
+    step, trunk = drawn.step, drawn.command.target.trunk_position[..., :2]
+    straight = trunk[:, :, :1] + (drawn.time / step.period[..., None])[..., None] * (trunk[:, :, -1:] - trunk[:, :, :1])
+    if kind not in STEPPING:
+        assert trunk == pytest.approx(straight, abs=1e-5)
+        return
+    stance = of_foot(step.end.ankle_positions, 1 - step.swing.argmax(axis=-1))[..., :2]
+    other = of_foot(step.end.ankle_positions, step.swing.argmax(axis=-1))[..., :2]
+    across = of_foot(step.end.ankle_yaws, 1 - step.swing.argmax(axis=-1))
+    across = np.stack([-np.sin(across), np.cos(across)], axis=-1)  # to the left of the stance foot
+    across *= np.sign(((stance - other) * across).sum(axis=-1, keepdims=True))
+    sway = ((trunk - straight) * across[:, :, None]).sum(axis=-1)
+    if kind in ("walk", "stairs"):
+        expected = 0.1 - 0.1 / np.cosh(step.pendulum * step.period / 2)
+        assert sway.max(axis=2) == pytest.approx(expected, abs=2e-3)
+    assert np.quantile(sway.max(axis=2), 0.05) > 0.01
+    assert sway.max() < 0.12
+
+
+def test_some_sway_and_some_do_not(curriculum: Curriculum, draw: Callable) -> None:
+    """Of [-0.5, 2.5] a sixth lies below 0 and half above 1."""
+    ranges = curriculum.ranges._replace(sway=(-0.5, 1.0, 2.5))
+    sway = draw(sampling.distribution(ranges, Shares(1, 1, 1, 1, 1, 1), 1.0, 0.0, (1, 8))).motion.sway
+    assert [(sway == 0).mean(), (sway == 1).mean()] == pytest.approx([1 / 6, 1 / 2], abs=4 * math.sqrt(0.25 / 2000))
+    assert (sway >= 0).all() and (sway <= 1).all()
+
+
 @STEPPING_KINDS
 def test_feet_are_lifted_by_4_to_15_cm_give_or_take_their_variation(episodes: Callable, kind: str) -> None:
     drawn = episodes(kind)
