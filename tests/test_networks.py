@@ -10,7 +10,7 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
-from bipedtrack import curriculum, networks, policy
+from bipedtrack import curriculum, networks, policy, robot
 from bipedtrack.checkpoint import CheckpointError
 from bipedtrack.control import ControlConfig
 
@@ -25,7 +25,8 @@ def plan(**network: Any) -> curriculum.Curriculum:
 
 def parameters(config: curriculum.Curriculum, seed: int = 0) -> tuple[Any, ppo_networks.PPONetworks]:
     """Brax's parameters with a normaliser that has seen data and an actor of random biases, and brax's networks."""
-    made = networks.make(config.network, 101, 12, preprocess_observations_fn=running_statistics.normalize)
+    normalize = running_statistics.normalize
+    made = networks.make(config.network, 101, 12, the_robot=robot.load(), preprocess_observations_fn=normalize)
     keys = jax.random.split(jax.random.PRNGKey(seed), 4)
     actor = made.policy_network.init(keys[0])
     noise = [jax.random.normal(keys[1], leaf.shape) for leaf in jax.tree.leaves(actor)]
@@ -128,7 +129,7 @@ def test_the_exported_policy_keeps_to_the_control_law_of_the_stage_it_comes_from
 
 def test_the_actor_begins_with_the_noise_of_the_curriculum_and_an_unbounded_gaussian() -> None:
     config = plan(initial_noise=0.4)
-    made = networks.make(config.network, 101, 12)
+    made = networks.make(config.network, 101, 12, the_robot=robot.load())
     params = made.policy_network.init(jax.random.PRNGKey(0))
     distribution = made.parametric_action_distribution
     logits = made.policy_network.apply(None, params, jnp.zeros((2000, 101)))
