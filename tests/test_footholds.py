@@ -18,7 +18,7 @@ def test_steps_are_those_of_training(robot: robots.Robot) -> None:
     start = footsteps.initial_nodes(robot)
     for foot in range(2):
         for ahead, turn in ((0.2, 0.0), (-0.1, 0.25), (0.0, -0.35)):
-            motion = tasks.Motion(sampling.WALK, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75)
+            motion = tasks.Motion(sampling.WALK, np.array([ahead, 0.0, turn]), foot, 0.55, 0.08, 0.75, 0.0)
             places, yaws = tasks._foothold(motion, 0.0, False, foot, motion.advance, start)
             mine = footholds.moved_on(start, foot, np.array([ahead, 0.0, turn]))
             assert np.allclose(mine[1:], [*places[foot][:2], yaws[foot]], atol=1e-6)
