@@ -52,6 +52,8 @@ class Evaluate:
     """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
     engine: Literal["mjx", "mujoco", "converged", "both"] = "both"
     """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one; converged is that alone."""
+    sway: float = 0.0
+    """How much the commanded trunk sways over the stance foot: 0: it moves uniformly, 1: as a linear inverted pendulum."""
     seed: int = SEED
     """Decides the episodes, together with the task's name."""
     out: pathlib.Path = pathlib.Path("evaluation")
@@ -204,7 +206,7 @@ def _tasks(options: Evaluate) -> tuple[str, ...]:
     from bipedtrack import suite
 
     if options.script is not None:
-        footsteps.load(options.script, robot.load())  # refused before anything is written
+        footsteps.load(options.script, robot.load(), options.sway)  # refused before anything is written
         return (options.script.stem,)
     for name in options.tasks:
         if name not in suite.TASKS:
@@ -218,11 +220,15 @@ def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.
 
     if options.script is not None or name in suite.SCRIPTS:
         path = options.script or scripts.ready()[name]
-        script = footsteps.load(path, the_robot)
+        script = footsteps.load(path, the_robot, options.sway)
         # a script is the same every time: more episodes would tell nothing
         return suite.script_batch(script, 1), footsteps.duration(script)
     seconds = suite.duration(name, sampling.Ranges(), options.seconds)
-    return suite.batch(name, sampling.Ranges(), the_robot, options.episodes, seconds, options.seed), seconds
+    return suite.batch(name, _ranges(options), the_robot, options.episodes, seconds, options.seed), seconds
+
+
+def _ranges(options: Evaluate) -> sampling.Ranges:
+    return sampling.Ranges()._replace(sway=(options.sway,) * 3)
 
 
 def _level(level: suite.Level, recorded: trace.Trace) -> dict[str, Any]:
@@ -269,7 +275,7 @@ def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float
     from bipedtrack import suite
 
     episodes = min(options.episodes, 64)
-    batch = suite.batch("walk-forward", sampling.Ranges(), who.robot, episodes, options.seconds, options.seed)
+    batch = suite.batch("walk-forward", _ranges(options), who.robot, episodes, options.seconds, options.seed)
     found: dict[str, Any] = {}
     for name, ladder in LADDERS.items():
         rows = []
@@ -328,6 +334,8 @@ def _check(options: Evaluate) -> None:
         raise config.ConfigError("name at least one policy: a policy.npz, a run directory, ik or zero")
     if options.episodes < 1:
         raise config.ConfigError(f"--episodes {options.episodes}: must be at least 1")
+    if not 0 <= options.sway <= 1:
+        raise config.ConfigError(f"--sway {options.sway:g}: must be from 0 to 1")
     if not 0.1 <= options.seconds <= 600:
         raise config.ConfigError(f"--seconds {options.seconds}: must lie in [0.1, 600]")
     if options.feedback_ratio is not None and not 0 <= options.feedback_ratio <= 2:

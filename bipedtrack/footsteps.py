@@ -20,8 +20,6 @@ defaults. What the cells mean and what empty ones do:
     trunk_roll, trunk_pitch  orientation is Rz(yaw) Ry(pitch) Rx(roll); empty: 0, level
     trunk_yaw                empty: the mean of the feet's yaws
 
-While one foot steps, the trunk sways over the other one on its way (planner.TaskStep.pendulum).
-
 With `both`, x, y, z, yaw and lift stay empty and the period is how long the trunk takes. A foot that is up needs its z, and
 the other one can not step until it is down again. A line with nothing but `both` and perhaps a period holds: every target
 stays where it is. So does everything after the last line. A yaw counts modulo a whole turn; feet and trunk turn the shorter
@@ -57,6 +55,7 @@ TRUNK_HEIGHT = 0.75  # m above the mean of the footholds
 FEET_Y = (0.1, -0.1)  # m, left and right at the start
 _ALONG = np.array([0.05, 0.5, 0.95])  # inner control points of the fourth-order swing curves, share of the way
 EASE = 0.25  # planner.TaskStep.ease
+SWAY = 0.0  # the policy that ships knows uniform trunks alone
 _HEIGHTS = np.ones(3)  # and as multiples of the height that lifts a foot by `lift`
 
 
@@ -73,8 +72,11 @@ class Script(NamedTuple):
     lines: tuple[int, ...]  # where in the file each step stands, from 1
 
 
-def load(path: str | Path, robot: Robot) -> Script:
-    """The script of a CSV file. Raises ScriptError, also where the file cannot be read or is not UTF-8."""
+def load(path: str | Path, robot: Robot, sway: float = SWAY) -> Script:
+    """The script of a CSV file; `sway` as in `parse`.
+
+    Raises ScriptError, also where the file cannot be read or is not UTF-8.
+    """
     try:
         text = Path(path).read_bytes().decode("utf-8-sig")
     except OSError as error:
@@ -83,12 +85,13 @@ def load(path: str | Path, robot: Robot) -> Script:
         line = error.object.count(b"\n", 0, error.start) + 1
         byte = error.object[error.start]
         raise ScriptError(f"{path}:{line}: byte 0x{byte:02x} is not UTF-8; save the file as UTF-8") from None
-    return parse(text, robot, str(path))
+    return parse(text, robot, str(path), sway)
 
 
-def parse(text: str, robot: Robot, name: str) -> Script:
+def parse(text: str, robot: Robot, name: str, sway: float = SWAY) -> Script:
     """The script that the text of a CSV file describes; `name` stands before the line numbers of problems.
 
+    `sway` says how much the trunk sways over the stance foot: 0 not at all, 1 as a linear inverted pendulum.
     Raises ScriptError with all problems. Whether a foothold can be reached and stood on is asked only where
     feet, trunk and boxes are known: not after a cell that could not be read, until the feet are placed anew.
     """
@@ -103,9 +106,12 @@ def parse(text: str, robot: Robot, name: str) -> Script:
             problems[line].append(f"the box stands where the {leg} foot starts, {place}; wanted it elsewhere")
 
     written = rows.read_rows(lines, robot.timestep, problems)
-    steps, within_reach = [], True
+    steps: list[TaskStep] = []
+    within_reach = True
     for row in written:
-        step = task_step(robot, boxes.values(), now, row.feet, row.values)
+        step = task_step(robot, boxes.values(), now, row.feet, row.values, sway)
+        if steps:
+            step = step._replace(velocity=planner.final_velocity(steps[-1]))
         if boxes_known and _known(step.end):
             problems[row.line] += feasibility.foothold_problems(robot, boxes, step, row.up)
             problems[row.line] += feasibility.support_problems(robot, boxes, step)
@@ -174,9 +180,9 @@ def commands(script: Script, timestep: float, seconds: float | None = None) -> I
 
 
 def task_step(
-    robot: Robot, boxes: Iterable[Box], start: Nodes, feet: Sequence[int], values: Mapping[str, float]
+    robot: Robot, boxes: Iterable[Box], start: Nodes, feet: Sequence[int], values: Mapping[str, float], sway: float = SWAY
 ) -> TaskStep:
-    """The task step of a line, from where the last one ended, with every default filled in.
+    """The task step of a line, from where the last one ended, with every default filled in; its trunk starts at rest.
 
     Args:
       robot: its constants.
@@ -184,6 +190,7 @@ def task_step(
       start: where the last task step ended.
       feet: indices of the feet that step, none where the trunk moves alone, both in a jump.
       values: the line's cells by the names of rows.UNITS, without the empty ones.
+      sway: of the trunk, as a share of statics.pendulum; 0: it moves uniformly, also where no foot moves.
     """
     given = values.get
     ankles, yaws = start.ankle_positions.copy(), start.ankle_yaws.copy()
@@ -208,7 +215,9 @@ def task_step(
         trigonometric=np.float64(0),
         ease=np.float64(EASE),
         pivot=pivot,
-        pendulum=np.float64(frequency if len(feet) == 1 else 0),
+        pendulum=np.float64(sway * frequency if len(feet) == 1 else 0),
+        rests=np.float64(sway > 0 and not feet),
+        velocity=np.zeros(2),
     )
 
 

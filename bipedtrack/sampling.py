@@ -35,7 +35,7 @@ class Ranges(NamedTuple):
     curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
     trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
     swing_ease: tuple[float, float, float] = (0.2, 0.25, 0.3)  # planner.TaskStep.ease; 0: the paper's uniform curves
-    sway: tuple[float, float, float] = (1.0, 1.0, 1.0)  # clipped to [0, 1]: factor on statics.pendulum; 0: the paper's trunk
+    sway: tuple[float, float, float] = (0.0, 0.0, 0.0)  # clipped to [0, 1]: factor on statics.pendulum; 0: the paper's trunk
     posture_x: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # m, centre of mass before the feet's middle (stand, squat)
     posture_y: tuple[float, float, float] = (-0.04, 0.0, 0.04)  # m, to the left of it
     posture_height: tuple[float, float, float] = (0.60, 0.75, 0.79)  # m

@@ -52,7 +52,6 @@ class _Random:
 
 
 _UNIFORM = {"swing_ease": (0.0, 0.0, 0.0)}  # Bezier curves as the paper may have run through them
-_STRAIGHT = {"sway": (0.0, 0.0, 0.0)}  # the trunk moves uniformly, as the paper says
 _FORWARD = {"walk_step": (0.03, 0.03, 0.25)}
 _BASIC = {
     "stand": _Random("stand"),
@@ -70,9 +69,6 @@ _BASIC = {
 _VARIANTS = {
     "walk-forward-uniform": _Random("walk", _FORWARD | _UNIFORM),
     "stairs-up-uniform": _Random("stairs", _UNIFORM, down_share=0.0),
-    "walk-forward-straight": _Random("walk", _FORWARD | _STRAIGHT),
-    "stairs-up-straight": _Random("stairs", _STRAIGHT, down_share=0.0),
-    "stairs-down-straight": _Random("stairs", _STRAIGHT, down_share=1.0),
     "walk-breaks": _Random("walk", break_share=1.0),
     "stairs-breaks": _Random("stairs", break_share=1.0),
 }
@@ -110,7 +106,7 @@ def batch(name: str, ranges: sampling.Ranges, the_robot: robot.Robot, episodes: 
         narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
     words += "; swings run through uniformly" if "swing_ease" in what.narrowed else ""
-    words += "; the trunk moves uniformly" if "sway" in what.narrowed else ""
+    words += "; the trunk sways" if ranges.sway[2] > 0 else ""
     words += "; a pause or the feet together every few task steps" if what.break_share else ""
     levels = _grid(episodes) if what.kind == "stairs" else _thirds(what.kind, plan)
     return Batch(plan, (terrain.STAIR_BOX,) * terrain.STAIR_BOXES, words, levels)

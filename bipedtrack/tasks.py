@@ -37,7 +37,7 @@ class Motion(NamedTuple):
     period: Array  # () s
     lift: Array  # () m
     trunk_height: Array  # () m
-    sway: Array  # () in [0, 1], planner.TaskStep.pendulum as a share of statics.pendulum
+    sway: Array  # () in [0, 1], planner.TaskStep.pendulum as a share of statics.pendulum; 0: the paper's uniform trunk
 
 
 class Task(NamedTuple):
@@ -214,7 +214,10 @@ def _choose(condition: Array, new: Array, old: Array) -> Array:
 
 
 def next_step(key: Array, given: Distribution, task: Task, index: Array, start: Nodes, robot: Robot) -> TaskStep:
-    """Task step number `index` of an episode, from where the last one ended; of a whole number of control periods."""
+    """Task step number `index` of an episode, from where the last one ended; of a whole number of control periods.
+
+    Its trunk starts at rest; where it does not, the last step's `planner.final_velocity` is to be put in.
+    """
     key_step, key_curve, key_posture = jax.random.split(key, 3)
     motion = _present(given, task, index)
     hold = index >= task.hold_after
@@ -267,6 +270,8 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
         ease=draw["swing_ease"],
         pivot=pivot,
         pendulum=motion.sway * swing.max() * frequency,
+        rests=((motion.sway > 0) & ~steps).astype(jnp.float32),
+        velocity=jnp.zeros(2),
     )
 
 

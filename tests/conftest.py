@@ -76,13 +76,16 @@ def episodes(robot: robots.Robot, curriculum: Curriculum) -> Callable[..., Episo
 
     @functools.cache
     def draw(
-        kind: str, difficulty: float = 1.0, hold_after: tuple[int, int] | None = None, break_share: float = 0.0
+        kind: str,
+        difficulty: float = 1.0,
+        hold_after: tuple[int, int] | None = None,
+        break_share: float = 0.0,
+        sway: float = 0.0,
     ) -> Episodes:
         shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
         hold_share = 0.0 if hold_after is None else 1.0
-        given = sampling.distribution(
-            curriculum.ranges, shares, difficulty, hold_share, hold_after or (1, 8), break_share=break_share
-        )
+        ranges = curriculum.ranges._replace(sway=(sway, sway, sway))
+        given = sampling.distribution(ranges, shares, difficulty, hold_share, hold_after or (1, 8), break_share=break_share)
         keys = jax.random.split(jax.random.PRNGKey(sampling.KINDS.index(kind)), count)
         return Episodes(*jax.tree.map(np.asarray, batched(keys, given)))
 

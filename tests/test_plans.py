@@ -5,6 +5,7 @@ import itertools
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -58,7 +59,8 @@ def laid(robot: Robot, unoptimised: None) -> Laid:
     def distribution(kind: str, down: float, hold: int | None) -> sampling.Distribution:
         shares = sampling.Shares(**{name: float(name == kind) for name in sampling.KINDS})
         after = (hold or 1, hold or 8)
-        return sampling.distribution(sampling.Ranges(), shares, 1.0, float(hold is not None), after, down)
+        ranges = sampling.Ranges()._replace(sway=(1.0, 1.0, 1.0))
+        return sampling.distribution(ranges, shares, 1.0, float(hold is not None), after, down)
 
     given = jax.tree.map(lambda *leaves: np.stack(leaves), *(distribution(*case) for case in CASES.values()))
     keys = jax.random.split(jax.random.PRNGKey(3), len(CASES))
@@ -68,19 +70,19 @@ def laid(robot: Robot, unoptimised: None) -> Laid:
     begin = jax.jit(jax.vmap(lambda key, given: tasks.begin(key, given, robot)))
 
     @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, 0, 0, None, 0))
-    def following(key: Any, given: Any, task: Any, index: Any, start: Any) -> Any:
-        step = tasks.next_step(key, given, task, index, start, robot)
+    @functools.partial(jax.vmap, in_axes=(0, 0, 0, None, 0, 0))
+    def following(key: Any, given: Any, task: Any, index: Any, start: Any, velocity: Any) -> Any:
+        step = tasks.next_step(key, given, task, index, start, robot)._replace(velocity=velocity)
         return step, tasks.stair_window(given, task, index)
 
     for_steps, for_begin = jax.vmap(jax.random.split, out_axes=1)(keys)
     step_keys = jax.vmap(lambda key: jax.random.split(key, STEPS), out_axes=1)(for_steps)
     task, start = begin(for_begin, given)
-    found, first = [], start
+    found, first, velocity = [], start, jnp.zeros((len(CASES), 2))
     for index in range(STEPS):
-        step, boxes = following(step_keys[index], given, task, np.int32(index), start)
+        step, boxes = following(step_keys[index], given, task, np.int32(index), start, velocity)
         found.append((step, boxes))
-        start = step.end
+        start, velocity = step.end, jax.vmap(planner.final_velocity)(step)
     steps, boxes = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *found)
     return Laid(plan, jax.tree.map(np.asarray, first), steps, boxes)
 
@@ -192,7 +194,7 @@ def test_boxes_of_a_script_plan_worked_by_hand(robot: Robot) -> None:
 def of_periods(periods: np.ndarray) -> Plan:
     """A plan of which only the periods are known."""
     nowhere: Any = None
-    return Plan(TaskStep(nowhere, nowhere, periods, *[nowhere] * 7), np.zeros((len(periods), 0, 7)))
+    return Plan(TaskStep(nowhere, nowhere, periods, *[nowhere] * 9), np.zeros((len(periods), 0, 7)))
 
 
 @given(

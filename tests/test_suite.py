@@ -86,9 +86,6 @@ def test_every_task_has_a_name_of_its_own() -> None:
         "stairs-breaks",
         "walk-forward-uniform",
         "stairs-up-uniform",
-        "walk-forward-straight",
-        "stairs-up-straight",
-        "stairs-down-straight",
         "hold-wander",
         "hold-60s-wander",
     }
@@ -413,10 +410,18 @@ def test_only_what_says_so_has_swings_that_are_run_through_uniformly(robot: Robo
     assert ("uniformly" in drawn.ranges) == (ease == 0)
 
 
-@pytest.mark.parametrize(
-    ("task", "sways"), [("walk-forward", True), ("walk-forward-straight", False), ("stairs-down-straight", False)]
-)
-def test_only_what_says_so_has_a_trunk_that_moves_uniformly(robot: Robot, task: str, sways: bool) -> None:
-    drawn = suite.batch(task, sampling.Ranges(), robot, 4, 2.0, 0)
-    assert ((drawn.plan.steps.pendulum > 3) == sways).all()  # sqrt(g / 1 m) is 3.1 1/s
-    assert ("the trunk moves uniformly" in drawn.ranges) != sways
+@pytest.mark.parametrize("task", ["walk-forward", "hold-stairs-down", "squat"])
+def test_trunks_sway_and_come_to_rest_where_it_is_asked_for(robot: Robot, task: str) -> None:
+    plain, swaying = (
+        suite.batch(task, sampling.Ranges()._replace(sway=(sway,) * 3), robot, 4, 4.0, 0) for sway in (0.0, 1.0)
+    )
+    steps = swaying.plan.steps
+    swings = steps.swing.any(axis=-1)
+    assert (plain.plan.steps.pendulum == 0).all() and (plain.plan.steps.rests == 0).all()
+    assert ((steps.pendulum > 3) == swings).all()  # sqrt(g / 1 m) is 3.1 1/s
+    assert ((steps.rests == 1) == ~swings).all()
+    assert (np.abs(steps.velocity[:, 1:]).max(axis=-1) > 0)[swings[:, :-1]].all()
+    assert (steps.velocity[:, 1:][~swings[:, :-1]] == 0).all() and (steps.velocity[:, 0] == 0).all()
+    assert [("sways" in batch.ranges) for batch in (plain, swaying)] == [False, True]
+    ends = [np.asarray(batch.plan.steps.end.trunk_position) for batch in (plain, swaying)]
+    assert (ends[0] == ends[1]).all()
