@@ -217,14 +217,18 @@ def control_of(curriculum: Curriculum, stage: Stage) -> ControlConfig:
     return stage.control or curriculum.control
 
 
-def scripts_of(stage: Stage, robot: Robot) -> list[footsteps.Script]:
-    """The footstep scripts of a stage. Raises config.ConfigError where one is missing, wrong or not on level ground."""
+def scripts_of(curriculum: Curriculum, stage: Stage, robot: Robot) -> list[footsteps.Script]:
+    """The footstep scripts of a stage; their trunk sways as its mildest task steps do.
+
+    Raises config.ConfigError where one is missing, wrong or not on level ground.
+    """
     ready, found = scripts.ready(), []
+    sway = min(max((stage.ranges or curriculum.ranges).sway[1], 0.0), 1.0)
     for name in stage.scripts:
         if name not in ready and not name.endswith(".csv"):
             raise config.ConfigError(f"stage {stage.name!r}: no script named {name!r}; there are: {', '.join(ready)}")
         try:
-            found.append(footsteps.load(ready.get(name, pathlib.Path(name)), robot))
+            found.append(footsteps.load(ready.get(name, pathlib.Path(name)), robot, sway))
         except footsteps.ScriptError as error:
             raise config.ConfigError(f"stage {stage.name!r}: {str(error).splitlines()[0]}") from None
         if found[-1].boxes:

@@ -335,7 +335,7 @@ def _check(options: Evaluate) -> None:
     if options.episodes < 1:
         raise config.ConfigError(f"--episodes {options.episodes}: must be at least 1")
     if not 0 <= options.sway <= 1:
-        raise config.ConfigError(f"--sway {options.sway:g}: must be from 0 to 1")
+        raise config.ConfigError(f"--sway {options.sway}: must lie in [0, 1]")
     if not 0.1 <= options.seconds <= 600:
         raise config.ConfigError(f"--seconds {options.seconds}: must lie in [0.1, 600]")
     if options.feedback_ratio is not None and not 0 <= options.feedback_ratio <= 2:

@@ -196,7 +196,7 @@ def _job(options: Train) -> Job:
     if plan.network.symmetric and not symmetry.is_symmetric(the_robot):
         raise config.ConfigError(f"network.symmetric: robot {plan.robot!r} is not its own mirror image; wanted false")
     for stage in plan.stages:  # rather than in the last hour
-        curriculum.scripts_of(stage, the_robot)
+        curriculum.scripts_of(plan, stage, the_robot)
     return Job(config.to_dict(plan), options.seed, options.devices)
 
 

@@ -66,7 +66,7 @@ def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: cur
     )
     the_robot, source = robot.load(config.robot), tasks.RANDOM
     if stage.scripts:
-        library = plans.library(curriculum.scripts_of(stage, the_robot))
+        library = plans.library(curriculum.scripts_of(config, stage, the_robot))
         source = plans.with_scripts(source, library, stage.script_share)
     return env.TrackingEnv(the_robot, settings, given, source)
 

@@ -256,12 +256,13 @@ def test_a_missing_file_is_refused_by_its_path(tmp_path: pathlib.Path) -> None:
 def test_scripts_that_cannot_be_trained_with_are_refused(
     tmp_path: pathlib.Path, robot: Robot, names: tuple[str, ...], words: str
 ) -> None:
-    ground, hold = loaded(tmp_path, MINIMAL).stages
-    assert curriculum.scripts_of(hold, robot) == []
+    plan = loaded(tmp_path, MINIMAL)
+    ground, hold = plan.stages
+    assert curriculum.scripts_of(plan, hold, robot) == []
     stage = dataclasses.replace(ground, scripts=("hop", "kick"), script_share=0.1)
-    assert [len(script.steps) > 5 for script in curriculum.scripts_of(stage, robot)] == [True, True]
+    assert [len(script.steps) > 5 for script in curriculum.scripts_of(plan, stage, robot)] == [True, True]
     with pytest.raises(config.ConfigError) as caught:
-        curriculum.scripts_of(dataclasses.replace(stage, scripts=names), robot)
+        curriculum.scripts_of(plan, dataclasses.replace(stage, scripts=names), robot)
     assert words in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="need each other"):
         dataclasses.replace(ground, scripts=("hop",))
@@ -269,5 +270,16 @@ def test_scripts_that_cannot_be_trained_with_are_refused(
 
 @pytest.mark.parametrize("name", ["best", "paper", "quick", "smoke"])
 def test_scripts_of_the_curricula_that_ship_can_be_trained_with(name: str, robot: Robot) -> None:
-    for stage in load(name).stages:
-        assert len(curriculum.scripts_of(stage, robot)) == len(stage.scripts)
+    plan = load(name)
+    for stage in plan.stages:
+        assert len(curriculum.scripts_of(plan, stage, robot)) == len(stage.scripts)
+
+
+def test_a_stages_scripts_sway_as_its_task_steps(tmp_path: pathlib.Path, robot: Robot) -> None:
+    plan = loaded(tmp_path, MINIMAL)
+    stage = dataclasses.replace(plan.stages[0], scripts=("kick",), script_share=0.1)
+    for sway, sways in (((-1.0, 0.0, 1.0), False), ((0.0, 1.0, 2.5), True)):
+        ranges = plan.ranges._replace(sway=sway)
+        for one in (dataclasses.replace(stage, ranges=ranges), stage):
+            script = curriculum.scripts_of(dataclasses.replace(plan, ranges=ranges), one, robot)[0]
+            assert any(step.pendulum > 3 for step in script.steps) == sways

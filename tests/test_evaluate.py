@@ -133,6 +133,7 @@ REFUSALS = {  # the arguments and a part of the line
     "ik --script nowhere.csv": "nowhere.csv: cannot be read (No such file or directory)",
     "ik --script bad.csv": "bad.csv:3: foot is 'middle'; wanted left, right, left up, right up, jump or both",
     "ik --episodes 0": "--episodes 0: must be at least 1",
+    "ik --sway 1.5": "--sway 1.5: must lie in [0, 1]",
     "ik --seconds 0": "--seconds 0.0: must lie in [0.1, 600]",
     "ik --seconds nan": "--seconds nan: must lie in [0.1, 600]",
     "ik --feedback-ratio 3": "--feedback-ratio 3.0: must lie in [0, 2]",
