@@ -92,9 +92,6 @@ class Drive:
     ...     drive.advance()
     """
 
-    step: TaskStep  # under way
-    _tick: int  # control steps into it
-
     def __init__(self, controller: policy.Controller, boxes: Sequence[Box] = ()):
         """A robot that stands at the start of every script, among boxes, and holds."""
         self.controller = controller
@@ -150,8 +147,8 @@ class Drive:
 
     def _begin(self, planned: Planned) -> None:
         """The next task step, from now on."""
-        self.step, self._tick = planned.step._replace(velocity=planner.final_velocity(self.step)), 0
-        self.taken.append(self.step)
+        self.step, self._tick = planned.step, 0
+        self.taken.append(planned.step)
         if planned.note:
             self.note = planned.note
         swing = np.flatnonzero(planned.step.swing)

@@ -226,7 +226,7 @@ class TrackingEnv(brax.envs.Env):
         """The task step after the present one, for all control steps of a policy step, which is far shorter than either."""
         key, key_step = jax.random.split(episode.key)
         step = self._task_step(key_step, episode.given, episode.task, episode.index + 1, episode.step.end)
-        return episode._replace(key=key), step._replace(velocity=planner.final_velocity(episode.step))
+        return episode._replace(key=key), step
 
     def _pushed(self, episode: Episode) -> Episode:
         """The episode with this policy step's force: none, one that goes on, or a new one in any horizontal direction."""

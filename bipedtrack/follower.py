@@ -225,8 +225,6 @@ class Follower:
             ease=np.float64(0),
             pivot=np.zeros(2),
             pendulum=np.float64(0),
-            rests=np.float64(0),
-            velocity=np.zeros(2),
         )
 
 

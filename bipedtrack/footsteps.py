@@ -106,12 +106,9 @@ def parse(text: str, robot: Robot, name: str, sway: float = SWAY) -> Script:
             problems[line].append(f"the box stands where the {leg} foot starts, {place}; wanted it elsewhere")
 
     written = rows.read_rows(lines, robot.timestep, problems)
-    steps: list[TaskStep] = []
-    within_reach = True
+    steps, within_reach = [], True
     for row in written:
         step = task_step(robot, boxes.values(), now, row.feet, row.values, sway)
-        if steps:
-            step = step._replace(velocity=planner.final_velocity(steps[-1]))
         if boxes_known and _known(step.end):
             problems[row.line] += feasibility.foothold_problems(robot, boxes, step, row.up)
             problems[row.line] += feasibility.support_problems(robot, boxes, step)
@@ -182,7 +179,7 @@ def commands(script: Script, timestep: float, seconds: float | None = None) -> I
 def task_step(
     robot: Robot, boxes: Iterable[Box], start: Nodes, feet: Sequence[int], values: Mapping[str, float], sway: float = SWAY
 ) -> TaskStep:
-    """The task step of a line, from where the last one ended, with every default filled in; its trunk starts at rest.
+    """The task step of a line, from where the last one ended, with every default filled in.
 
     Args:
       robot: its constants.
@@ -190,7 +187,7 @@ def task_step(
       start: where the last task step ended.
       feet: indices of the feet that step, none where the trunk moves alone, both in a jump.
       values: the line's cells by the names of rows.UNITS, without the empty ones.
-      sway: of the trunk, as a share of statics.pendulum; 0: it moves uniformly, also where no foot moves.
+      sway: of the trunk, as a share of statics.pendulum, where one foot steps; 0: it moves uniformly.
     """
     given = values.get
     ankles, yaws = start.ankle_positions.copy(), start.ankle_yaws.copy()
@@ -216,8 +213,6 @@ def task_step(
         ease=np.float64(EASE),
         pivot=pivot,
         pendulum=np.float64(sway * frequency if len(feet) == 1 else 0),
-        rests=np.float64(sway > 0 and not feet),
-        velocity=np.zeros(2),
     )
 
 

@@ -9,8 +9,7 @@ lets it gather speed first. The paper says nothing of it; 0 is uniform.
 
 A trunk that moves uniformly midway between two feet of which one alone carries it is what no robot can do: it would have
 to be pushed from where nothing stands. `pendulum` lets it sway over the stance foot as its weight makes it do (Kajita et
-al., "The 3D linear inverted pendulum mode", IROS 2001). With both feet on the ground `rests` lets it come to rest from the
-velocity with which the last step left it, where the paper's would have to stop at once. Not in the paper; 0 is uniform.
+al., "The 3D linear inverted pendulum mode", IROS 2001). Not in the paper; 0 is uniform.
 """
 
 from __future__ import annotations
@@ -38,8 +37,6 @@ class TaskStep(NamedTuple):
     ease: Array  # () share of the period in which Bezier curves gather speed from rest, and brake to rest; below 0.5
     pivot: Array  # (2,) m, where the trunk would balance on the stance foot
     pendulum: Array  # () 1/s, sqrt(g / height) of a trunk that sways about the pivot; 0: it moves uniformly
-    rests: Array  # () 1: the trunk starts with `velocity` and comes to rest, pendulum or not; 0: it does not
-    velocity: Array  # (2,) m/s, of the trunk when the last step was over: its `final_velocity`
 
 
 class Command(NamedTuple):
@@ -112,44 +109,6 @@ def swayed(step: TaskStep, time: Array) -> tuple[Array, Array]:
     return step.pivot + of_start * start + of_end * end, gain * end - loss * start
 
 
-def settled(step: TaskStep, s: Array) -> tuple[Array, Array]:
-    """Where a trunk is that comes to rest at the end, (3,) m, and its velocity, (3,) m/s, at the share s of the period, ().
-
-    The cubic from the start with `velocity` to the end at rest. Up and down it starts at rest: a trunk that went on rising
-    would soon be at the end of its legs.
-    """
-    xp = namespace(step.period)
-    travel = step.end.trunk_position - step.start.trunk_position
-    velocity = xp.concat([step.velocity, xp.zeros_like(step.velocity[:1])])
-    way, carried = s * s * (3 - 2 * s), s * (1 - s) * (1 - s)
-    way_rate, carried_rate = 6 * s * (1 - s), (1 - s) * (1 - 3 * s)
-    place = step.start.trunk_position + way * travel + carried * step.period * velocity
-    return place, way_rate / step.period * travel + carried_rate * velocity
-
-
-def final_velocity(step: TaskStep) -> Array:
-    """The trunk's velocity in the plane when the step is over, (2,) m/s: the next one's `velocity`."""
-    xp = namespace(step.period)
-    uniform = (step.end.trunk_position - step.start.trunk_position)[:2] / step.period
-    velocity = xp.where(step.pendulum > 0, swayed(step, step.period)[1], uniform)
-    return xp.where(step.rests > 0, xp.zeros_like(velocity), velocity)
-
-
-def _trunk(step: TaskStep, s: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """At the share s of the period: place, (3,) m, and velocity, (3,) m/s; share of the turn, (), and its rate, () 1/s."""
-    xp = namespace(step.period)
-    travel = step.end.trunk_position - step.start.trunk_position
-    falling, fall = swayed(step, s * step.period)
-    resting, braking = settled(step, s)
-    place, rate = step.start.trunk_position + s * travel, travel / step.period
-    sways, rests = step.pendulum > 0, step.rests > 0
-    place = xp.where(rests, resting, xp.concat([xp.where(sways, falling, place[:2]), place[2:]]))
-    rate = xp.where(rests, braking, xp.concat([xp.where(sways, fall, rate[:2]), rate[2:]]))
-    turned = xp.where(rests, s * s * (3 - 2 * s), s)
-    turning = xp.where(rests, 6 * s * (1 - s), xp.ones_like(s)) / step.period
-    return (place, rate), (turned, turning)
-
-
 def command(step: TaskStep, time: Array) -> Command:
     """The command at `time` seconds, (), into the step; from the period on its end stands still (rates and T are zero)."""
     xp = namespace(step.period)
@@ -164,21 +123,25 @@ def command(step: TaskStep, time: Array) -> Command:
     ankles = xp.where(step.trigonometric > 0, on_sine, on_bezier)
     ankle_rates = xp.where(step.trigonometric > 0, sine_rate, along_rate * bezier_rate)
 
-    (place, velocity), (turned, turning) = _trunk(step, s)
     turn = rotations.multiply(rotations.conjugate(start.trunk_orientation), end.trunk_orientation)
     turn = rotations.to_rotation_vector(turn)  # constant axis: the same in both trunk frames
-    orientation = rotations.multiply(start.trunk_orientation, rotations.from_rotation_vector(turned * turn))
+    orientation = rotations.multiply(start.trunk_orientation, rotations.from_rotation_vector(s * turn))
+    travel = end.trunk_position - start.trunk_position
+    sways = step.pendulum > 0
+    place, velocity = swayed(step, s * step.period)
+    place = xp.where(sways, place, start.trunk_position[:2] + s * travel[:2])
+    velocity = xp.where(sways, running * velocity, per_second * travel[:2])
     yaw_travel = rotations.wrap(end.ankle_yaws - start.ankle_yaws)
 
     target = Nodes(
-        trunk_position=place,
+        trunk_position=xp.concat([place, start.trunk_position[2:] + s * travel[2:]]),
         trunk_orientation=orientation,
         ankle_positions=ankles,
         ankle_yaws=start.ankle_yaws + (s * s * (3 - 2 * s)) * yaw_travel,
     )
     rates = NodeRates(
-        trunk_velocity=running * velocity,
-        trunk_angular_velocity=rotations.to_matrix(start.trunk_orientation) @ (running * turning * turn),
+        trunk_velocity=xp.concat([velocity, per_second * travel[2:]]),
+        trunk_angular_velocity=rotations.to_matrix(start.trunk_orientation) @ (per_second * turn),
         ankle_velocities=per_second * ankle_rates,
         ankle_yaw_rates=(per_second * 6 * s * (1 - s)) * yaw_travel,
     )

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import footsteps, planner, robot, sampling, tasks, terrain
+from bipedtrack import footsteps, robot, sampling, tasks, terrain
 from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.rotations import Array
@@ -33,14 +33,12 @@ def random_plan(key: Array, given: sampling.Distribution, the_robot: robot.Robot
     key, key_begin = jax.random.split(key)
     task, start = tasks.begin(key_begin, given, the_robot)
 
-    def one(before: tuple[Nodes, Array], numbered: tuple[Array, Array]) -> tuple[Any, tuple[TaskStep, Array]]:
+    def one(start: Nodes, numbered: tuple[Array, Array]) -> tuple[Nodes, tuple[TaskStep, Array]]:
         index, key = numbered
-        start, velocity = before
-        step = tasks.next_step(key, given, task, index, start, the_robot)._replace(velocity=velocity)
-        return (step.end, planner.final_velocity(step)), (step, tasks.stair_window(given, task, index))
+        step = tasks.next_step(key, given, task, index, start, the_robot)
+        return step.end, (step, tasks.stair_window(given, task, index))
 
-    before = start, jnp.zeros(2)
-    _, (laid_out, boxes) = jax.lax.scan(one, before, (jnp.arange(steps), jax.random.split(key, steps)))
+    _, (laid_out, boxes) = jax.lax.scan(one, start, (jnp.arange(steps), jax.random.split(key, steps)))
     return Plan(laid_out, boxes)
 
 
@@ -53,7 +51,6 @@ def script_plan(script: footsteps.Script) -> Plan:
         lift=np.zeros(2),
         ankle_points=np.repeat(last.end.ankle_positions[:, None], last.ankle_points.shape[1], axis=1),
         pendulum=np.float64(0),
-        velocity=np.zeros(2),
     )
     boxes = np.array([np.concatenate([box.position, box.orientation]) for box in script.boxes]).reshape(-1, 7)
     steps = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *script.steps, hold)
@@ -124,7 +121,6 @@ def mirrored(plan: Plan) -> Plan:
             lift=steps.lift[..., ::-1],
             ankle_points=steps.ankle_points[..., ::-1, :, :] * [1, -1, 1],
             pivot=steps.pivot * [1, -1],
-            velocity=steps.velocity * [1, -1],
         )
     )
 

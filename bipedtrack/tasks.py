@@ -214,10 +214,7 @@ def _choose(condition: Array, new: Array, old: Array) -> Array:
 
 
 def next_step(key: Array, given: Distribution, task: Task, index: Array, start: Nodes, robot: Robot) -> TaskStep:
-    """Task step number `index` of an episode, from where the last one ended; of a whole number of control periods.
-
-    Its trunk starts at rest; where it does not, the last step's `planner.final_velocity` is to be put in.
-    """
+    """Task step number `index` of an episode, from where the last one ended; of a whole number of control periods."""
     key_step, key_curve, key_posture = jax.random.split(key, 3)
     motion = _present(given, task, index)
     hold = index >= task.hold_after
@@ -270,8 +267,6 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
         ease=draw["swing_ease"],
         pivot=pivot,
         pendulum=motion.sway * swing.max() * frequency,
-        rests=((motion.sway > 0) & ~steps).astype(jnp.float32),
-        velocity=jnp.zeros(2),
     )
 
 

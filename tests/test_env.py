@@ -130,17 +130,6 @@ def test_metrics_hold_every_reward_term_from_the_first_state_on(mixed: list[Any]
         assert set(state.metrics) == terms | errors | {"fell", "nonfinite"}
 
 
-def test_a_task_step_begins_with_the_velocity_that_the_trunk_has_at_the_end_of_the_last(
-    flat: Compiled, mixed: list[Any]
-) -> None:
-    episode = mixed[0].info["episode"]
-    _, following = jax.jit(jax.vmap(flat.env.look_ahead), compiler_options=QUICK_COMPILE)(episode)
-    steps = jax.tree.map(lambda leaf: np.asarray(leaf, float), episode.step)  # of a trunk that moves uniformly
-    moved = (steps.end.trunk_position - steps.start.trunk_position)[:, :2] / steps.period[:, None]
-    np.testing.assert_allclose(following.velocity, moved, atol=1e-5)
-    assert np.abs(moved).max() > 0.05
-
-
 def test_reward_is_the_weighted_sum_of_the_terms(mixed: list[Any]) -> None:
     for state in mixed[1:]:
         by_hand = sum(np.asarray(state.metrics[name], float) * w for name, w in WEIGHTS._asdict().items())

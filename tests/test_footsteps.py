@@ -89,7 +89,7 @@ def test_commands_of_a_script_worked_by_hand() -> None:
 
 
 def test_a_trunk_sways_over_the_stance_foot_where_it_is_asked_to() -> None:
-    """Half way through the first step, and where the trunk alone moves: it comes to rest from the second step's velocity."""
+    """Half way through the first step; where it alone moves, as everywhere without sway, it moves uniformly."""
     straight, swaying = (footsteps.parse(WALK, RANGER, "walk.csv", sway) for sway in (0.0, 1.0))
     step = swaying.steps[0]
     first, second = balanced(step.start), balanced(step.end)
@@ -99,12 +99,8 @@ def test_a_trunk_sways_over_the_stance_foot_where_it_is_asked_to() -> None:
     np.testing.assert_allclose(middle.target.trunk_position, swayed, atol=1e-3)
     rate = step.pendulum * (second - first) / 2 / math.sinh(step.pendulum * 0.25)
     np.testing.assert_allclose(middle.rates.trunk_velocity, rate, atol=6e-3)
-
-    last, bow = swaying.steps[1:3]
-    goes_on = planner.command(last, last.period - 1e-9).rates.trunk_velocity
-    np.testing.assert_allclose(planner.command(bow, np.float64(0)).rates.trunk_velocity[:2], goes_on[:2], atol=1e-6)
-    assert [step.rests for step in swaying.steps] == [0, 0, 1, 1]
-    assert [(step.pendulum, step.rests) for step in straight.steps] == [(0, 0)] * 4
+    assert [step.pendulum > 0 for step in swaying.steps] == [True, True, False, False]
+    assert [step.pendulum for step in straight.steps] == [0] * 4
 
 
 def test_defaults() -> None:

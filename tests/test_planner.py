@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from bipedtrack import planner
@@ -51,8 +50,6 @@ def random_step(random: np.random.Generator, trigonometric: float, order: int = 
         ease=np.asarray(random.choice([0.0, random.uniform(0.01, 0.49)])),
         pivot=random.uniform(-1, 1, 2),
         pendulum=np.asarray(random.choice([0.0, random.uniform(2, 5)])),
-        rests=np.asarray(random.choice([0.0, 1.0])),
-        velocity=random.uniform(-1, 1, 2),
     )
     return jax.tree.map(lambda x: np.asarray(x, dtype), step)
 
@@ -156,7 +153,7 @@ def test_target_leads_from_the_start_to_the_end(trigonometric: float, random: np
 
 @given(random=SEEDS, s=st.floats(0, 1))
 def test_trunk_moves_uniformly_and_turns_about_one_axis(random: np.random.Generator, s: float) -> None:
-    step = random_step(random, 0.0)._replace(pendulum=np.asarray(0.0), rests=np.asarray(0.0))
+    step = random_step(random, 0.0)._replace(pendulum=np.asarray(0.0))
     target = planner.command(step, s * step.period).target
     start, end = step.start, step.end
     assert target.trunk_position == pytest.approx((1 - s) * start.trunk_position + s * end.trunk_position)
@@ -169,7 +166,7 @@ def test_trunk_moves_uniformly_and_turns_about_one_axis(random: np.random.Genera
 @pytest.mark.parametrize("seed", range(5))
 def test_trunk_sways_as_a_linear_inverted_pendulum(seed: int) -> None:
     """Integrated from its first position and velocity, x'' = w^2 (x - pivot) arrives at the end in the period."""
-    step = random_step(np.random.default_rng(seed), 0.0)._replace(pendulum=np.asarray(4.0), rests=np.asarray(0.0))
+    step = random_step(np.random.default_rng(seed), 0.0)._replace(pendulum=np.asarray(4.0))
     times = np.linspace(0, float(step.period), 9)[:-1]
     found = [planner.command(step, time) for time in times]
     first = np.concatenate([step.start.trunk_position[:2], found[0].rates.trunk_velocity[:2]])
@@ -192,37 +189,12 @@ def test_sway_worked_by_hand() -> None:
     step = random_step(np.random.default_rng(0), 0.0)
     start = step.start._replace(trunk_position=np.array([0.0, 0.0, 0.75]))
     step = step._replace(
-        start=start,
-        end=start,
-        period=np.asarray(0.5),
-        pivot=np.array([0.0, 0.1]),
-        pendulum=np.asarray(4.0),
-        rests=np.asarray(0.0),
+        start=start, end=start, period=np.asarray(0.5), pivot=np.array([0.0, 0.1]), pendulum=np.asarray(4.0)
     )
     middle = planner.command(step, np.asarray(0.25))
     assert middle.target.trunk_position == pytest.approx([0, 0.1 - 0.1 / math.cosh(1), 0.75])
     assert middle.rates.trunk_velocity == pytest.approx(0, abs=1e-12)
     assert planner.command(step, np.asarray(0.0)).rates.trunk_velocity[1] == pytest.approx(0.4 * math.tanh(1))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_trunk_comes_to_rest_on_the_cubic_from_its_last_velocity(seed: int) -> None:
-    step = random_step(np.random.default_rng(seed), 0.0)._replace(rests=np.asarray(1.0))
-    period = float(step.period)
-    ends = [step.start.trunk_position, step.end.trunk_position]
-    expected = CubicHermiteSpline([0, period], ends, [[*step.velocity, 0], np.zeros(3)])
-    for time in np.linspace(0, period, 9)[:-1]:
-        found = planner.command(step, time)
-        assert found.target.trunk_position == pytest.approx(expected(time))
-        assert found.rates.trunk_velocity == pytest.approx(expected(time, 1))
-    assert (planner.final_velocity(step) == 0).all()
-
-
-@given(random=SEEDS)
-def test_a_steps_final_velocity_is_the_one_it_ends_with(random: np.random.Generator) -> None:
-    step = random_step(random, 0.0)
-    last = planner.command(step, step.period * (1 - 1e-9)).rates.trunk_velocity[:2]
-    assert planner.final_velocity(step) == pytest.approx(last, abs=1e-6)
 
 
 @given(random=SEEDS)

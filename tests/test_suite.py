@@ -411,17 +411,14 @@ def test_only_what_says_so_has_swings_that_are_run_through_uniformly(robot: Robo
 
 
 @pytest.mark.parametrize("task", ["walk-forward", "hold-stairs-down", "squat"])
-def test_trunks_sway_and_come_to_rest_where_it_is_asked_for(robot: Robot, task: str) -> None:
+def test_trunks_sway_where_it_is_asked_for(robot: Robot, task: str) -> None:
     plain, swaying = (
         suite.batch(task, sampling.Ranges()._replace(sway=(sway,) * 3), robot, 4, 4.0, 0) for sway in (0.0, 1.0)
     )
     steps = swaying.plan.steps
     swings = steps.swing.any(axis=-1)
-    assert (plain.plan.steps.pendulum == 0).all() and (plain.plan.steps.rests == 0).all()
+    assert (plain.plan.steps.pendulum == 0).all()
     assert ((steps.pendulum > 3) == swings).all()  # sqrt(g / 1 m) is 3.1 1/s
-    assert ((steps.rests == 1) == ~swings).all()
-    assert (np.abs(steps.velocity[:, 1:]).max(axis=-1) > 0)[swings[:, :-1]].all()
-    assert (steps.velocity[:, 1:][~swings[:, :-1]] == 0).all() and (steps.velocity[:, 0] == 0).all()
     assert [("sways" in batch.ranges) for batch in (plain, swaying)] == [False, True]
     ends = [np.asarray(batch.plan.steps.end.trunk_position) for batch in (plain, swaying)]
     assert (ends[0] == ends[1]).all()
