@@ -52,7 +52,7 @@ class Evaluate:
     """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
     engine: Literal["mjx", "mujoco", "converged", "both"] = "both"
     """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one; converged is that alone."""
-    sway: float = 0.0
+    sway: float = footsteps.SWAY
     """How much the commanded trunk sways over the stance foot: 0: it moves uniformly, 1: as a linear inverted pendulum."""
     seed: int = SEED
     """Decides the episodes, together with the task's name."""

@@ -1,8 +1,9 @@
-"""What the joints carry when the robot stands still: torques by virtual work, in closed form.
+"""How the robot's weight bears on it: what its joints carry when it stands still, and how it falls off one foot.
 
-A joint's torque is what lifting costs, d(potential energy)/dq, less what the ground pays, F dz/dq of the point where it
-pushes; the trunk is held in thought, for the forces of the feet hold it. Everything is level: axes and arms are turned
-from the trunk frame F_B into one whose z axis is the vertical. The namespace follows the arguments; axis 0 is (left, right).
+Torques are by virtual work, in closed form: a joint's is what lifting costs, d(potential energy)/dq, less what the ground
+pays, F dz/dq of the point where it pushes; the trunk is held in thought, for the forces of the feet hold it. Everything is
+level: axes and arms are turned from the trunk frame F_B into one whose z axis is the vertical. The namespace follows the
+arguments; axis 0 is (left, right).
 """
 
 from __future__ import annotations

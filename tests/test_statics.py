@@ -1,4 +1,4 @@
-"""The static torques against MuJoCo's: its gravity, and its Jacobians of the points where the feet push."""
+"""Static torques against MuJoCo's gravity and its Jacobians of the points where the feet push; balance on one foot."""
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,15 @@ def posture(robot: Robot, seed: int) -> Nodes:
     return footsteps.balanced(robot, nodes, ankles.mean(axis=0)[:2] + random.uniform(-0.03, 0.03, 2))
 
 
+def placed(robot: Robot, model: mujoco.MjModel, nodes: Nodes, level_feet: bool) -> tuple[np.ndarray, mujoco.MjData]:
+    """The joint angles (12,), rad, of a robot on its nodes, and MuJoCo with it at rest there."""
+    joints = control.denormalize(robot, control.feedforward(robot, ControlConfig(level_feet=level_feet), nodes))
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, joints])
+    mujoco.mj_forward(model, data)
+    return joints, data
+
+
 @pytest.mark.parametrize("stands", [(True, True), (True, False), (False, True), (False, False)])
 @pytest.mark.parametrize("seed", range(5))
 def test_torques_are_those_of_mujocos_gravity_and_jacobians(
@@ -32,10 +41,7 @@ def test_torques_are_those_of_mujocos_gravity_and_jacobians(
 ) -> None:
     """With the forces that the load says, MuJoCo's trunk is held up too: nothing is left over in any of 18 equations."""
     nodes = posture(robot, seed)
-    joints = control.denormalize(robot, control.feedforward(robot, ControlConfig(level_feet=True), nodes))
-    data = mujoco.MjData(mj_model)
-    data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, joints])
-    mujoco.mj_forward(mj_model, data)
+    joints, data = placed(robot, mj_model, nodes, level_feet=True)
     weight = 9.81 * mj_model.body_subtreemass[0]
     ankles = np.array([data.body(f"{leg}_foot").xpos for leg in ("left", "right")])
     centre = data.subtree_com[0]
@@ -92,10 +98,7 @@ def test_a_pendulum_balances_mujocos_centre_of_mass_over_the_foot(
     robot: Robot, mj_model: mujoco.MjModel, seed: int, foot: int
 ) -> None:
     nodes = posture(robot, seed)
-    joints = control.denormalize(robot, control.feedforward(robot, ControlConfig(level_feet=False), nodes))
-    data = mujoco.MjData(mj_model)
-    data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, joints])
-    mujoco.mj_forward(mj_model, data)
+    _, data = placed(robot, mj_model, nodes, level_feet=False)
     pivot, frequency = statics.pendulum(robot, nodes, foot)
     moved = data.subtree_com[0][:2] + pivot - nodes.trunk_position[:2]
     assert moved == pytest.approx(nodes.ankle_positions[foot, :2], abs=3e-4)
