@@ -217,13 +217,18 @@ def control_of(curriculum: Curriculum, stage: Stage) -> ControlConfig:
     return stage.control or curriculum.control
 
 
+def ranges_of(curriculum: Curriculum, stage: Stage) -> Ranges:
+    """The ranges of a stage: its own, or the curriculum's."""
+    return stage.ranges or curriculum.ranges
+
+
 def scripts_of(curriculum: Curriculum, stage: Stage, robot: Robot) -> list[footsteps.Script]:
     """The footstep scripts of a stage; their trunk sways as its mildest task steps do.
 
     Raises config.ConfigError where one is missing, wrong or not on level ground.
     """
     ready, found = scripts.ready(), []
-    sway = min(max((stage.ranges or curriculum.ranges).sway[1], 0.0), 1.0)
+    sway = ranges_of(curriculum, stage).usual_sway
     for name in stage.scripts:
         if name not in ready and not name.endswith(".csv"):
             raise config.ConfigError(f"stage {stage.name!r}: no script named {name!r}; there are: {', '.join(ready)}")

@@ -123,7 +123,8 @@ class Drive:
         """One control step of `timestep` seconds: command, controller, physics, and the next task step where one is over."""
         import mujoco
 
-        command = planner.command(self.step, np.float64(self._tick * self.timestep))
+        step = self.step._replace(pendulum=self._sway * self.step.pendulum)
+        command = planner.command(step, np.float64(self._tick * self.timestep))
         self.target = command.target
         errors = nodes.difference(command.target, kinematics.measure(self.robot, self.data.qpos))
         if self.mode is not Mode.FALLEN and fallen(self.data.qpos, self.data.qvel, errors):
@@ -148,6 +149,7 @@ class Drive:
     def _begin(self, planned: Planned) -> None:
         """The next task step, from now on."""
         self.step, self._tick = planned.step, 0
+        self._sway = self.controller.policy.sway  # as long as the step lasts
         self.taken.append(planned.step)
         if planned.note:
             self.note = planned.note

@@ -52,8 +52,9 @@ class Evaluate:
     """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
     engine: Literal["mjx", "mujoco", "converged", "both"] = "both"
     """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one; converged is that alone."""
-    sway: float = footsteps.SWAY
-    """How much the commanded trunk sways over the stance foot: 0: it moves uniformly, 1: as a linear inverted pendulum."""
+    sway: float | None = None
+    """How much the commanded trunk sways over the stance foot: 0: it moves uniformly, 1: as a linear inverted pendulum.
+    Default: as the policies learned it; `ik` and `zero` alone 1."""
     seed: int = SEED
     """Decides the episodes, together with the task's name."""
     out: pathlib.Path = pathlib.Path("evaluation")
@@ -164,6 +165,7 @@ def boxes_of(batch: suite.Batch) -> Boxes | None:
 def run(options: Evaluate) -> dict[str, Any]:
     """Evaluates everything asked for, writes it to `out` and returns what metrics.json holds."""
     who = [subject(name, options) for name in options.policies]
+    options = dataclasses.replace(options, sway=_sway(who, options))
     wanted = _tasks(options)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "traces").mkdir(exist_ok=True)
@@ -206,7 +208,7 @@ def _tasks(options: Evaluate) -> tuple[str, ...]:
     from bipedtrack import suite
 
     if options.script is not None:
-        footsteps.load(options.script, robot.load(), options.sway)  # refused before anything is written
+        footsteps.load(options.script, robot.load(), _ranges(options).usual_sway)  # refused before anything is written
         return (options.script.stem,)
     for name in options.tasks:
         if name not in suite.TASKS:
@@ -220,15 +222,28 @@ def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.
 
     if options.script is not None or name in suite.SCRIPTS:
         path = options.script or scripts.ready()[name]
-        script = footsteps.load(path, the_robot, options.sway)
+        script = footsteps.load(path, the_robot, _ranges(options).usual_sway)
         # a script is the same every time: more episodes would tell nothing
         return suite.script_batch(script, 1), footsteps.duration(script)
     seconds = suite.duration(name, sampling.Ranges(), options.seconds)
     return suite.batch(name, _ranges(options), the_robot, options.episodes, seconds, options.seed), seconds
 
 
+def _sway(who: list[Subject], options: Evaluate) -> float:
+    """How much all trunks sway. Raises ConfigError where the policies know different ones and none is asked for."""
+    if options.sway is not None:
+        return options.sway
+    known = {one.actor.sway: one.name for one in who if one.actor is not None}
+    if len(known) > 1:
+        each = ", ".join(f"{name} with --sway {sway:g}" for sway, name in known.items())
+        raise config.ConfigError(f"the policies learned different trunks ({each}); wanted one --sway for all of them")
+    return next(iter(known), footsteps.SWAY)
+
+
 def _ranges(options: Evaluate) -> sampling.Ranges:
-    return sampling.Ranges()._replace(sway=(options.sway,) * 3)
+    """Table II's, with the trunk that is asked for."""
+    ranges = sampling.Ranges()
+    return ranges if options.sway is None else ranges._replace(sway=(options.sway,) * 3)
 
 
 def _level(level: suite.Level, recorded: trace.Trace) -> dict[str, Any]:
@@ -334,7 +349,7 @@ def _check(options: Evaluate) -> None:
         raise config.ConfigError("name at least one policy: a policy.npz, a run directory, ik or zero")
     if options.episodes < 1:
         raise config.ConfigError(f"--episodes {options.episodes}: must be at least 1")
-    if not 0 <= options.sway <= 1:
+    if options.sway is not None and not 0 <= options.sway <= 1:
         raise config.ConfigError(f"--sway {options.sway}: must lie in [0, 1]")
     if not 0.1 <= options.seconds <= 600:
         raise config.ConfigError(f"--seconds {options.seconds}: must lie in [0.1, 600]")

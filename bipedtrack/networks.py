@@ -136,8 +136,9 @@ def to_policy(
 ) -> policy.Policy:
     """The exported policy of a checkpoint's arrays: the actor's mean, its normaliser and all that surrounds them.
 
-    `call` is the last finished one: the control law is that of its stage.
+    `call` is the last finished one: control law and sway are those of its stage.
     """
+    stage = curriculum.calls(config)[max(call, 0)].stage
     normalizer, actor, _ = from_arrays(config, arrays)
     layers = actor["params"]["MLP_0"]
     dense = [layers[f"hidden_{i}"] for i in range(len(config.network.actor))] + [actor["params"]["Dense_0"]]
@@ -149,9 +150,10 @@ def to_policy(
             biases=tuple(np.asarray(layer["bias"]) for layer in dense),
         ),
         activation=config.network.activation,
-        settings=curriculum.control_of(config, curriculum.calls(config)[max(call, 0)].stage),
+        settings=curriculum.control_of(config, stage),
         policy_period=config.policy_period,
         robot=robot.load(config.robot),
         provenance=provenance,
         symmetric=config.network.symmetric,
+        sway=curriculum.ranges_of(config, stage).usual_sway,
     )

@@ -65,6 +65,7 @@ class Policy:
     robot: Robot
     provenance: dict[str, Any]  # where it comes from: curriculum, seed, steps, versions
     symmetric: bool = False  # the network is shown the mirror image where the right foot leads (`symmetry`)
+    sway: float = 0.0  # of the trunks that it learned to carry, as a share of statics.pendulum, for whoever plans for it
 
     def output(self, flat_observation: Array) -> Array:
         """The mean of the action distribution (..., 12) for observations (..., 101)."""
@@ -92,6 +93,7 @@ def save(policy: Policy, path: str | pathlib.Path) -> None:
         "control": config.to_dict(policy.settings),
         "policy_period": policy.policy_period,
         "symmetric": policy.symmetric,
+        "sway": policy.sway,
         "robot": {k: v for k, v in robot_fields.items() if not isinstance(v, np.ndarray)},
         "provenance": policy.provenance,
     }
@@ -150,6 +152,7 @@ def _assembled(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Policy:
         robot=Robot(**robot_meta),
         provenance=meta["provenance"],
         symmetric=meta.get("symmetric", False),  # files from before there was a choice
+        sway=meta.get("sway", 0.0),
     )
 
 
@@ -188,6 +191,8 @@ def _check(policy: Policy) -> None:
         raise PolicyError(f"activation {policy.activation!r} is unknown; wanted one of {', '.join(ACTIVATIONS)}")
     if not isinstance(policy.symmetric, bool):
         raise PolicyError(f"symmetric must be true or false, not {policy.symmetric!r}")
+    if not (isinstance(policy.sway, float) and 0 <= policy.sway <= 1):
+        raise PolicyError(f"sway must lie in [0, 1], not {policy.sway!r}")
     if policy.symmetric and not symmetry.is_symmetric(robot):
         raise PolicyError("the policy is symmetric, but its robot is not its own mirror image")
     if not (network.std > 0).all():

@@ -52,6 +52,11 @@ class Ranges(NamedTuple):
     push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
     stair_push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, on stairs, where there is no room to step aside
 
+    @property
+    def usual_sway(self) -> float:
+        """The sway of the mildest task steps, in [0, 1]."""
+        return min(max(self.sway[1], 0.0), 1.0)
+
     def validate(self) -> None:
         """Raises ValueError where a range does not grow."""
         for name, (low, mild, high) in self._asdict().items():

@@ -106,7 +106,7 @@ def main() -> None:
             raise ValueError(f"--seconds {options.seconds}: must be positive and less than 100000")
         the_robot = robot.load()
         controller = policy.Controller(policy.load(options.policy, the_robot), options.feedback)
-        script = footsteps.load(options.script, the_robot)
+        script = footsteps.load(options.script, the_robot, controller.policy.sway)
         recorded = record(controller, script, options.seconds)
         print(summary(recorded))
     except (ValueError, RuntimeError, OSError) as error:

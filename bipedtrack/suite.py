@@ -94,7 +94,7 @@ def batch(name: str, ranges: sampling.Ranges, the_robot: robot.Robot, episodes: 
       seed: with the task's name, decides the episodes.
     """
     if name in SCRIPTS:
-        return script_batch(footsteps.load(scripts.ready()[name], the_robot), episodes)
+        return script_batch(footsteps.load(scripts.ready()[name], the_robot, ranges.usual_sway), episodes)
     hold, what = name.startswith("hold-"), _what(name)
     steps = int(np.ceil(seconds / min(ranges.period[0], ranges.squat_period[0]))) + 1
     key = jax.random.fold_in(jax.random.PRNGKey(seed), zlib.crc32(name.encode()))

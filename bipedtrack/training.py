@@ -51,7 +51,7 @@ class Stopped(Exception):
 def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: curriculum.Lesson) -> env.TrackingEnv:
     """The environment of a stage's lesson; only a stage with stairs has boxes."""
     given = sampling.distribution(
-        stage.ranges or config.ranges,
+        curriculum.ranges_of(config, stage),
         stage.shares,
         lesson.difficulty,
         stage.hold_share,

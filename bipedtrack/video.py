@@ -241,7 +241,7 @@ _Recorded = tuple[Trace, np.ndarray, Sequence[Sequence[float]]]  # the trace, th
 
 def _record_script(options: Video, driven: policy.Policy) -> _Recorded:
     assert options.script is not None
-    script = footsteps.load(options.script, driven.robot)
+    script = footsteps.load(options.script, driven.robot, driven.sway)
     recorded = simulate.record(policy.Controller(driven, options.feedback), script, options.seconds)
     boxes = np.array([[*box.position, *box.orientation] for box in script.boxes]).reshape(-1, 7)
     return recorded, boxes, [box.size for box in script.boxes]
@@ -256,8 +256,9 @@ def _record_task(options: Video, driven: policy.Policy) -> _Recorded:
     if options.task not in suite.TASKS:
         raise ValueError(f"--task {options.task}: no such task; there are: {', '.join(suite.TASKS)}")
     asked = evaluate.Evaluate((str(options.policy),), feedback_ratio=None if options.feedback else 0.0)
-    seconds = suite.duration(options.task, sampling.Ranges(), options.seconds or asked.seconds)
-    batch = suite.batch(options.task, sampling.Ranges(), driven.robot, options.episode + 1, seconds, asked.seed)
+    ranges = sampling.Ranges()._replace(sway=(driven.sway,) * 3)
+    seconds = suite.duration(options.task, ranges, options.seconds or asked.seconds)
+    batch = suite.batch(options.task, ranges, driven.robot, options.episode + 1, seconds, asked.seed)
     batch = batch._replace(plan=jax.tree.map(lambda leaf: leaf[-1:], batch.plan))
     engines = evaluate.Engines(evaluate.subject(asked.policies[0], asked), "mujoco")
     recorded = engines.record("mujoco", batch, seconds).episode(0)

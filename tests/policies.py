@@ -33,4 +33,4 @@ def make_policy(network, policy_period=0.02, settings=None):
 def small_policy():
     """A policy whose every number differs from the defaults."""
     made = make_policy(random_network(2, (8, 6)), settings=ControlConfig(filter=0.3, velocity_feedforward=True))
-    return dataclasses.replace(made, symmetric=True)
+    return dataclasses.replace(made, symmetric=True, sway=0.25)

@@ -1,5 +1,6 @@
 """The shipped policy under somebody's hands, driven without a page."""
 
+import dataclasses
 import math
 import sys
 
@@ -75,6 +76,18 @@ def test_a_wish_waits_for_the_next_task_step(drive: Drive) -> None:
     drive.stop()
     drive.advance()
     assert drive.step is under_way
+
+
+def test_the_trunk_sways_as_the_policy_learned_it(shipped: policy.Policy) -> None:
+    """In the middle of the first step, on the spot: by 0.1 - 0.1 / cosh(w T / 2) m to the stance foot, or not at all."""
+    for sway in (0.0, 0.5, 1.0):
+        drive = Drive(policy.Controller(dataclasses.replace(shipped, sway=sway)))
+        drive.steer(ahead=1.0, step_length=0.02, period=0.5)
+        while not drive.step.swing.any():
+            drive.advance()
+        go(drive, 0.25)
+        expected = 0.1 - 0.1 / math.cosh(sway * drive.step.pendulum * 0.25)
+        assert abs(drive.target.trunk_position[1]) == pytest.approx(expected, abs=2e-3)
 
 
 def test_feet_alternate(drive: Drive) -> None:

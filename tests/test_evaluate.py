@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 import tyro
+from policies import small_policy
 from traces import by_mujoco
 
 import bipedtrack
@@ -133,6 +134,7 @@ REFUSALS = {  # the arguments and a part of the line
     "ik --script nowhere.csv": "nowhere.csv: cannot be read (No such file or directory)",
     "ik --script bad.csv": "bad.csv:3: foot is 'middle'; wanted left, right, left up, right up, jump or both",
     "ik --episodes 0": "--episodes 0: must be at least 1",
+    "sways.npz straight.npz": "(sways.npz with --sway 0.5, straight.npz with --sway 0); wanted one --sway for all of them",
     "ik --sway 1.5": "--sway 1.5: must lie in [0, 1]",
     "ik --seconds 0": "--seconds 0.0: must lie in [0.1, 600]",
     "ik --seconds nan": "--seconds nan: must lie in [0.1, 600]",
@@ -157,6 +159,8 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     content = FIRST.read_bytes()
     (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
     (tmp_path / "bad.csv").write_text("\n".join([*SHORT.splitlines()[:2], "middle,0.1"]))
+    for name, sway in (("sways", 0.5), ("straight", 0.0)):
+        policy.save(dataclasses.replace(small_policy(), sway=sway), tmp_path / f"{name}.npz")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     # should it not be refused, it shall at least be short
     short = {"--tasks": "stand", "--episodes": "1", "--engine": "mujoco"}
@@ -169,7 +173,7 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     assert (refusal.value.code, said.out, said.err.count("\n")) == (2, "", 1), said
     assert said.err.startswith("bipedtrack: ") and wanted in said.err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "cut.npz", "empty"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "cut.npz", "empty", "straight.npz", "sways.npz"]
 
 
 # Ablations
@@ -354,6 +358,7 @@ def test_metrics_say_what_was_asked_of_whom_and_with_what(runs: Runs) -> None:
         "feedforward": True,
     }
     assert wanted.items() <= options.items()
+    assert options["sway"] == policy.load(FIRST).sway  # as it learned it
     assert set(options) == {field.name for field in dataclasses.fields(evaluate.Evaluate)}
     for package in ("jax", "mujoco", "mujoco-mjx", "numpy"):
         assert record["versions"][package] == metadata.version(package)

@@ -117,14 +117,19 @@ def test_the_exported_policy_carries_what_surrounds_the_network() -> None:
     assert [weight.shape for weight in exported.network.weights] == [(101, 24), (24, 8), (8, 12)]
 
 
-def test_the_exported_policy_keeps_to_the_control_law_of_the_stage_it_comes_from() -> None:
+def test_the_exported_policy_keeps_to_the_control_law_and_the_sway_of_the_stage_it_comes_from() -> None:
     config, law = plan(), ControlConfig(integral=1.5)
-    config = dataclasses.replace(config, stages=(*config.stages, dataclasses.replace(config.stages[-1], control=law)))
+    ranges = (config.ranges._replace(sway=(-1.0, usual, 2.0)) for usual in (-0.5, 1.5))
+    config = dataclasses.replace(config, ranges=next(ranges))
+    last = dataclasses.replace(config.stages[-1], control=law, ranges=next(ranges))
+    config = dataclasses.replace(config, stages=(*config.stages, last))
     arrays = networks.to_arrays(parameters(config)[0])
     calls = curriculum.calls(config)
-    laws = [networks.to_policy(config, arrays, {}, call).settings for call in range(-1, len(calls))]
+    policies = [networks.to_policy(config, arrays, {}, call) for call in range(-1, len(calls))]
+    laws = [policy.settings for policy in policies]
     assert laws[0] == config.control  # before the first call
     assert laws[1:] == [law if call.stage.control else config.control for call in calls] and laws[-1] == law
+    assert [policy.sway for policy in policies] == [0.0] * len(calls) + [1.0]
 
 
 def test_the_actor_begins_with_the_noise_of_the_curriculum_and_an_unbounded_gaussian() -> None:

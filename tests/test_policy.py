@@ -129,7 +129,7 @@ def test_a_policy_comes_back_from_its_file_bit_for_bit(original, content, scratc
     for name, wanted in vars(ROBOT).items():
         found = getattr(loaded.robot, name)
         assert type(found) is type(wanted) and np.array_equal(found, wanted)
-    for name in ("activation", "settings", "policy_period", "provenance", "symmetric"):
+    for name in ("activation", "settings", "policy_period", "provenance", "symmetric", "sway"):
         assert getattr(loaded, name) == getattr(original, name)
     policy.save(loaded, scratch)
     assert scratch.read_bytes() == content
@@ -254,6 +254,8 @@ FORGERIES = {
     "bias half": (change("actor/2/bias", np.float16), "finite float32"),
     "mean integer": (change("normalizer/mean", lambda m: m.astype(np.int32)), "finite float32"),
     "symmetric by a word": (put("yes", "symmetric"), "symmetric must be true or false, not 'yes'"),
+    "sway beyond a pendulum's": (put(1.5, "sway"), "sway must lie in .0, 1., not 1.5"),
+    "sway by a word": (put("yes", "sway"), "sway must lie in .0, 1., not 'yes'"),
     "symmetric on unequal legs": (change("robot/kp", poke(123.0)), "its robot is not its own mirror image"),
     "unknown activation": (put("gelu", "activation"), "activation 'gelu' is unknown; wanted one of swish, tanh, relu"),
     "no activation": (lambda arrays, meta: meta.pop("activation"), "activation"),
