@@ -55,7 +55,7 @@ TRUNK_HEIGHT = 0.75  # m above the mean of the footholds
 FEET_Y = (0.1, -0.1)  # m, left and right at the start
 _ALONG = np.array([0.05, 0.5, 0.95])  # inner control points of the fourth-order swing curves, share of the way
 EASE = 0.25  # planner.TaskStep.ease
-SWAY = 0.0  # the policy that ships knows uniform trunks alone
+SWAY = 0.0  # of a trunk, as a share of statics.pendulum; 0: it moves uniformly, as the paper's
 _HEIGHTS = np.ones(3)  # and as multiples of the height that lifts a foot by `lift`
 
 

@@ -221,7 +221,7 @@ class Page:
     def _run_script(self) -> None:
         self._set(self._problems, "content", "")
         try:
-            script = footsteps.parse(self._text.value, self._robot, "script")
+            script = footsteps.parse(self._text.value, self._robot, "script", steering.FULL_SWAY)
         except footsteps.ScriptError as error:
             self._set(self._problems, "content", "\n".join(f"- {line}" for line in str(error).splitlines()))
             return

@@ -8,8 +8,9 @@ A Bezier curve that is run through uniformly leaves the ground at up to 4 m/s, w
 lets it gather speed first. The paper says nothing of it; 0 is uniform.
 
 A trunk that moves uniformly midway between two feet of which one alone carries it is what no robot can do: it would have
-to be pushed from where nothing stands. `pendulum` lets it sway over the stance foot as its weight makes it do (Kajita et
-al., "The 3D linear inverted pendulum mode", IROS 2001). Not in the paper; 0 is uniform.
+to be pushed from where nothing stands. `pendulum` lets it sway across the stance foot as its weight makes it do (Kajita et
+al., "The 3D linear inverted pendulum mode", IROS 2001). Along the foot, which is longer than wide, it stays uniform: as a
+pendulum it would end a step faster than that, and could not stop there. Not in the paper; 0 is uniform.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class TaskStep(NamedTuple):
     trigonometric: Array  # () 1: ankles follow trigonometric curves, 0: Bezier curves
     ease: Array  # () share of the period in which Bezier curves gather speed from rest, and brake to rest; below 0.5
     pivot: Array  # (2,) m, where the trunk would balance on the stance foot
-    pendulum: Array  # () 1/s, sqrt(g / height) of a trunk that sways about the pivot; 0: it moves uniformly
+    pendulum: Array  # () 1/s, sqrt(g / height) of a trunk that sways across the stance foot; 0: it moves uniformly
 
 
 class Command(NamedTuple):
@@ -109,6 +110,14 @@ def swayed(step: TaskStep, time: Array) -> tuple[Array, Array]:
     return step.pivot + of_start * start + of_end * end, gain * end - loss * start
 
 
+def _across_stance(step: TaskStep) -> Array:
+    """The direction in which a trunk sways, (2,): to the left of the stance foot; zero where it does not sway."""
+    xp = namespace(step.period)
+    heading = ((1 - step.swing) * step.start.ankle_yaws).sum()
+    left = xp.stack([-xp.sin(heading), xp.cos(heading)])
+    return xp.where(step.pendulum > 0, left, xp.zeros_like(left))
+
+
 def command(step: TaskStep, time: Array) -> Command:
     """The command at `time` seconds, (), into the step; from the period on its end stands still (rates and T are zero)."""
     xp = namespace(step.period)
@@ -127,10 +136,11 @@ def command(step: TaskStep, time: Array) -> Command:
     turn = rotations.to_rotation_vector(turn)  # constant axis: the same in both trunk frames
     orientation = rotations.multiply(start.trunk_orientation, rotations.from_rotation_vector(s * turn))
     travel = end.trunk_position - start.trunk_position
-    sways = step.pendulum > 0
+    across = _across_stance(step)
+    straight, uniform = start.trunk_position[:2] + s * travel[:2], per_second * travel[:2]
     place, velocity = swayed(step, s * step.period)
-    place = xp.where(sways, place, start.trunk_position[:2] + s * travel[:2])
-    velocity = xp.where(sways, running * velocity, per_second * travel[:2])
+    place = straight + across * (across @ (place - straight))
+    velocity = uniform + across * (across @ (running * velocity - uniform))
     yaw_travel = rotations.wrap(end.ankle_yaws - start.ankle_yaws)
 
     target = Nodes(

@@ -18,6 +18,7 @@ from bipedtrack.nodes import Nodes
 from bipedtrack.planner import TaskStep
 from bipedtrack.robot import LEGS, Robot
 
+FULL_SWAY = 1.0  # of a drive's task steps; `drive.Drive` lets the trunk do as much of it as the policy knows
 HOLD_SECONDS = 0.1  # of a task step that holds: soon enough for the next wish
 TRUNK_SECONDS = 1.0  # of a task step that moves the trunk alone
 _BACKWARD = 0.15  # m, the longest step backward in training
@@ -162,7 +163,8 @@ def step_to(robot: Robot, boxes: Sequence[Box], start: Nodes, to: Foothold, aske
     lift, uneven = _lift(robot, boxes, start, to, asked)
     period = max(asked.period, _BOX_SECONDS) if uneven else asked.period
     values = {"x": to.x, "y": to.y, "yaw": to.yaw, "period": period, "lift": lift}
-    return footsteps.task_step(robot, boxes, start, (to.foot,), values | _trunk(robot, ankles, yaws, asked))
+    values |= _trunk(robot, ankles, yaws, asked)
+    return footsteps.task_step(robot, boxes, start, (to.foot,), values, FULL_SWAY)
 
 
 def trunk_step(robot: Robot, start: Nodes, asked: Steering) -> TaskStep:

@@ -13,6 +13,7 @@ from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
 from bipedtrack.footholds import Foothold
 from bipedtrack.footsteps import Box
+from bipedtrack.steering import FULL_SWAY
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +221,7 @@ def test_a_drive_written_down_drives_the_same_way(drive: Drive, shipped: policy.
     go(drive, 1.5)
     drive.steer(trunk_height=0.7)
     at = go(drive, 2.5)
-    script = footsteps.parse(drive.as_script(), drive.robot, "drive")
+    script = footsteps.parse(drive.as_script(), drive.robot, "drive", FULL_SWAY)
     again = Drive(policy.Controller(shipped))
     again.run(script)
     there = go(again, footsteps.duration(script))

@@ -164,30 +164,36 @@ def test_trunk_moves_uniformly_and_turns_about_one_axis(random: np.random.Genera
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_trunk_sways_as_a_linear_inverted_pendulum(seed: int) -> None:
-    """Integrated from its first position and velocity, x'' = w^2 (x - pivot) arrives at the end in the period."""
+def test_trunk_sways_across_the_stance_foot_as_a_linear_inverted_pendulum(seed: int) -> None:
+    """Integrated from its first place and velocity, y'' = w^2 (y - pivot) arrives at the end in the period; x is uniform."""
     step = random_step(np.random.default_rng(seed), 0.0)._replace(pendulum=np.asarray(4.0))
     times = np.linspace(0, float(step.period), 9)[:-1]
     found = [planner.command(step, time) for time in times]
-    first = np.concatenate([step.start.trunk_position[:2], found[0].rates.trunk_velocity[:2]])
+    heading = step.start.ankle_yaws[step.swing.argmin()]
+    along, across = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
+    places = np.array([command.target.trunk_position for command in found])
+    rates = np.array([command.rates.trunk_velocity for command in found])
+    start, end = step.start.trunk_position, step.end.trunk_position
 
     def fall(_: float, state: np.ndarray) -> np.ndarray:
-        return np.concatenate([state[2:], 16 * (state[:2] - step.pivot)])
+        return np.array([state[1], 16 * (state[0] - across @ step.pivot)])
 
     span = 0, float(step.period)
+    first = [across @ start[:2], across @ rates[0, :2]]
     expected = solve_ivp(fall, span, first, t_eval=[*times, span[1]], rtol=1e-10, atol=1e-12).y.T
-    assert expected[-1, :2] == pytest.approx(step.end.trunk_position[:2], abs=1e-7)
-    assert np.array([command.target.trunk_position[:2] for command in found]) == pytest.approx(expected[:-1, :2], abs=1e-7)
-    assert np.array([command.rates.trunk_velocity[:2] for command in found]) == pytest.approx(expected[:-1, 2:], abs=1e-6)
-    heights = [command.target.trunk_position[2] for command in found]
-    way = step.end.trunk_position[2] - step.start.trunk_position[2]
-    assert heights == pytest.approx(step.start.trunk_position[2] + times / span[1] * way)
+    assert expected[-1, 0] == pytest.approx(across @ end[:2], abs=1e-7)
+    assert places[:, :2] @ across == pytest.approx(expected[:-1, 0], abs=1e-7)
+    assert rates[:, :2] @ across == pytest.approx(expected[:-1, 1], abs=1e-6)
+    share, way = times / span[1], end - start
+    assert places[:, :2] @ along == pytest.approx(along @ start[:2] + share * (along @ way[:2]))
+    assert rates[:, :2] @ along == pytest.approx(along @ way[:2] / span[1])
+    assert places[:, 2] == pytest.approx(start[2] + share * way[2])
 
 
 def test_sway_worked_by_hand() -> None:
     """Stepping in place, feet 0.2 m apart: the trunk turns back 0.1 - 0.1 / cosh(w T / 2) from the middle."""
     step = random_step(np.random.default_rng(0), 0.0)
-    start = step.start._replace(trunk_position=np.array([0.0, 0.0, 0.75]))
+    start = step.start._replace(trunk_position=np.array([0.0, 0.0, 0.75]), ankle_yaws=np.zeros(2))
     step = step._replace(
         start=start, end=start, period=np.asarray(0.5), pivot=np.array([0.0, 0.1]), pendulum=np.asarray(4.0)
     )
