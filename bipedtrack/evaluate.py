@@ -54,7 +54,7 @@ class Evaluate:
     """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one; converged is that alone."""
     sway: float | None = None
     """How much the commanded trunk sways over the stance foot: 0: it moves uniformly, 1: as a linear inverted pendulum.
-    Default: as the policies learned it; `ik` and `zero` alone 1."""
+    Default: as the policies learned it; 0 for `ik` and `zero` alone."""
     seed: int = SEED
     """Decides the episodes, together with the task's name."""
     out: pathlib.Path = pathlib.Path("evaluation")

@@ -55,7 +55,7 @@ class Ranges(NamedTuple):
     @property
     def usual_sway(self) -> float:
         """The sway of the mildest task steps, in [0, 1]."""
-        return min(max(self.sway[1], 0.0), 1.0)
+        return float(min(max(self.sway[1], 0.0), 1.0))
 
     def validate(self) -> None:
         """Raises ValueError where a range does not grow."""

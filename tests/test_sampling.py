@@ -25,6 +25,12 @@ def test_ranges_that_make_no_sense_are_refused(curriculum: Curriculum, name: str
         curriculum.ranges._replace(**{name: value}).validate()
 
 
+def test_the_usual_sway_is_the_mildest_within_what_a_pendulum_does(curriculum: Curriculum) -> None:
+    for mildest, usual in ((-0.5, 0.0), (0.4, 0.4), (1, 1.0), (1.5, 1.0)):
+        found = curriculum.ranges._replace(sway=(-1.0, mildest, 2.0)).usual_sway
+        assert found == usual and isinstance(found, float)
+
+
 @pytest.mark.parametrize("shares", [Shares(0, 0, 0, 0, 0, 0), Shares(1, 1, -1, 0, 0, 0)])
 def test_shares_that_draw_nothing_are_refused(shares: Shares) -> None:
     with pytest.raises(ValueError, match="shares"):
