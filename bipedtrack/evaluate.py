@@ -242,8 +242,7 @@ def _sway(who: list[Subject], options: Evaluate) -> float:
 
 def _ranges(options: Evaluate) -> sampling.Ranges:
     """Table II's, with the trunk that is asked for."""
-    ranges = sampling.Ranges()
-    return ranges if options.sway is None else ranges._replace(sway=(options.sway,) * 3)
+    return sampling.Ranges() if options.sway is None else sampling.Ranges().swaying(options.sway)
 
 
 def _level(level: suite.Level, recorded: trace.Trace) -> dict[str, Any]:

@@ -57,6 +57,10 @@ class Ranges(NamedTuple):
         """The sway of the mildest task steps, in [0, 1]."""
         return float(min(max(self.sway[1], 0.0), 1.0))
 
+    def swaying(self, sway: float) -> Ranges:
+        """The same with trunks that all sway so much."""
+        return self._replace(sway=(sway, sway, sway))
+
     def validate(self) -> None:
         """Raises ValueError where a range does not grow."""
         for name, (low, mild, high) in self._asdict().items():

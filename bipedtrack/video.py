@@ -256,7 +256,7 @@ def _record_task(options: Video, driven: policy.Policy) -> _Recorded:
     if options.task not in suite.TASKS:
         raise ValueError(f"--task {options.task}: no such task; there are: {', '.join(suite.TASKS)}")
     asked = evaluate.Evaluate((str(options.policy),), feedback_ratio=None if options.feedback else 0.0)
-    ranges = sampling.Ranges()._replace(sway=(driven.sway,) * 3)
+    ranges = sampling.Ranges().swaying(driven.sway)
     seconds = suite.duration(options.task, ranges, options.seconds or asked.seconds)
     batch = suite.batch(options.task, ranges, driven.robot, options.episode + 1, seconds, asked.seed)
     batch = batch._replace(plan=jax.tree.map(lambda leaf: leaf[-1:], batch.plan))
