@@ -18,11 +18,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from bipedtrack import rotations
 from bipedtrack.nodes import NodeRates, Nodes
 from bipedtrack.rotations import Array, namespace
 
 _LONG_AGO = 60.0  # time constants: nothing of a pendulum's start is left
+_SAMPLES = 33  # points of a curve that are held against edges
 
 
 class TaskStep(NamedTuple):
@@ -176,3 +179,21 @@ def swing_points(start: Array, end: Array, lift: Array, along: Array, height: Ar
     inner_z = xp.where((lift > 0)[:, None], inner_z, (start[:, 2:] + along[None, :] * way[:, 2:]))
     inner = xp.concat([inner_xy, inner_z[..., None]], axis=-1)
     return xp.concat([start[:, None], inner, end[:, None]], axis=1)
+
+
+def lift_over(start: Array, end: Array, lift: Array, along: Array, height: Array, edges: Array, reach: float) -> Array:
+    """`lift`, (2,) m, or as much more as brings the curves of `swing_points` over edges.
+
+    edges: (2, e, 2) x and z, m, of what each foot passes, running across x. No point of a curve that has an edge less than
+    `reach` m before or behind it is lower than that edge. The other arguments are those of `swing_points`.
+    """
+    xp = namespace(start)
+    order = along.shape[0] + 1
+    s = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
+    k = np.arange(order + 1)
+    weights = xp.asarray(np.array([math.comb(order, i) for i in k]) * s**k * (1 - s) ** (order - k), dtype=start.dtype)
+    curve = weights @ swing_points(start, end, lift, along, height)  # (2, samples, 3)
+    per_metre = weights @ swing_points(xp.zeros_like(start), xp.zeros_like(end), xp.ones_like(lift), along, height)[..., 2:]
+    near = xp.abs(curve[..., :1] - edges[:, None, :, 0]) < reach
+    lacking = (edges[:, None, :, 1] - curve[..., 2:]) / xp.maximum(per_metre, xp.full_like(per_metre, 1e-3))
+    return lift + xp.max(xp.where(near, lacking, xp.zeros_like(lacking)), axis=(1, 2), initial=0.0)

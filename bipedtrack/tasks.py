@@ -25,6 +25,8 @@ from bipedtrack.sampling import SIDLE, SQUAT, STAIRS, WALK, WANDER, Distribution
 MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
 ERRORS = ("ankle_error_cm", "ankle_yaw_error_deg", "trunk_error_cm", "trunk_error_deg")  # of `tracking_errors`
 _BREAKS = (2.0, 7.0)  # task steps from one break to the next, and one more than the most
+_CLEARANCE = 0.02  # m between a sole and the edge of a tread that it is led over
+_MARGIN = 0.015  # m before its toe and behind its heel, of which 1 cm is the contact spheres'
 _TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
 
 
@@ -245,16 +247,16 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     moves = functools.partial(jnp.where, squats | steps)
     end = jax.tree.map(moves, _over_feet(posture, ankles, yaws, robot), start)
     swing = jnp.where(steps, (jnp.arange(2) == swings).astype(jnp.float32), 0.0)
-    lift = swing * motion.lift * vary[1]
     pivot, frequency = statics.pendulum(robot, end, 1 - swings)
     u = jax.random.uniform(key_curve, (2, 3))
-    points = planner.swing_points(
-        start.ankle_positions,
-        ankles,
-        lift,
-        along=jnp.array([0.05, 0.5, 0.95]) + within(u[0], given.ranges["curve_along"]),
-        height=within(u[1], given.ranges["curve_height"]),
-    )
+    along = jnp.array([0.05, 0.5, 0.95]) + within(u[0], given.ranges["curve_along"])
+    curve = {"along": along, "height": within(u[1], given.ranges["curve_height"])}
+    lift = motion.lift * vary[1]
+    edges = terrain.stair_edges(task.stairs, start.ankle_positions, ankles) + jnp.array([0.0, _CLEARANCE])
+    reach = 0.5 * robot.sole[0] + _MARGIN
+    over = planner.lift_over(start.ankle_positions, ankles, jnp.full(2, lift), **curve, edges=edges, reach=reach)
+    lift = swing * jnp.where(motion.kind == STAIRS, over, lift)
+    points = planner.swing_points(start.ankle_positions, ankles, lift, **curve)
     return TaskStep(
         start=start,
         end=end,

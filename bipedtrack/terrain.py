@@ -48,6 +48,18 @@ def stair_boxes(stairs: Stairs, level: Array) -> Array:
     return xp.stack([x, xp.zeros_like(x), z], axis=-1)
 
 
+def stair_edges(stairs: Stairs, start: Array, end: Array) -> Array:
+    """The x and z, m, of the first and the last edge, (..., 2, 2), between the middles of two treads, (..., 3) m each.
+
+    Heights are as those of start and end: of ankles, if those are.
+    """
+    xp = namespace(start)
+    half, none = 0.5 * stairs.tread, xp.zeros_like(stairs.rise)
+    first = xp.stack([start[..., 0] + half, start[..., 2] + xp.maximum(stairs.rise, none)], axis=-1)
+    last = xp.stack([end[..., 0] - half, end[..., 2] + xp.maximum(-stairs.rise, none)], axis=-1)
+    return xp.stack([first, last], axis=-2)
+
+
 def parked() -> Array:
     """Poses (3, 7) of the boxes where there are no stairs; numpy."""
     return upright(np.array([[0.0, 0.0, PARKED - i] for i in range(STAIR_BOXES)]))

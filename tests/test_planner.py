@@ -254,6 +254,25 @@ def test_lift_counts_from_the_higher_end() -> None:
     assert points[:, :, 0] == pytest.approx(np.array([[0, 0.03, 0.3, 0.57, 0.6]] * 2))
 
 
+@pytest.mark.parametrize(
+    ("lift", "edge", "wanted"),
+    [
+        (0.1, (0.5, 0.2), 0.2),
+        (0.3, (0.5, 0.2), 0.3),
+        (0.1, (0.25, 0.2), 0.8 / 3),
+        (0.1, (0.75, -1.0), 0.1),
+        (0.1, (2.0, 9.0), 0.1),
+    ],
+)
+def test_a_curve_is_lifted_over_an_edge_worked_by_hand(lift: float, edge: tuple, wanted: float) -> None:
+    """A parabola from (0, 0) to (1, 0) has the height 4 lift x (1 - x)."""
+    start, end = np.zeros((2, 3)), np.array([[1.0, 0, 0], [0, 0, 0]])
+    curve = {"along": np.array([0.5]), "height": np.ones(1)}
+    edges = np.array([[edge], [(5.0, 9.0)]])
+    found = planner.lift_over(start, end, np.full(2, lift), **curve, edges=edges, reach=0.01)
+    assert found == pytest.approx(np.array([wanted, lift]))
+
+
 def test_without_lift_a_foot_slides_along_the_straight_line() -> None:
     start, end = np.array([[0.0, 0, 0.04]] * 2), np.array([[0.6, 0.3, 0.34], [0.6, -0.3, -0.26]])
     points = planner.swing_points(start, end, np.zeros(2), np.array([0.25, 0.5, 0.75]), np.array([0.8, 1, 1.2]))

@@ -13,7 +13,7 @@ from walks import parse
 from bipedtrack import robot as robots
 from bipedtrack import tasks, terrain
 from bipedtrack.robot import Robot
-from bipedtrack.terrain import STAIR_BOX, Stairs, stair_boxes
+from bipedtrack.terrain import STAIR_BOX, Stairs, stair_boxes, stair_edges
 
 LENGTH, _, HEIGHT = STAIR_BOX
 
@@ -162,26 +162,24 @@ def clearances(robot: Robot, drawn: Any, boxes: np.ndarray) -> tuple[np.ndarray,
     return from_boxes, from_edges
 
 
-@pytest.mark.parametrize(("difficulty", "least"), [(0.0, 0.045), (0.5, 0.017)])
+@pytest.mark.parametrize("hold_after", [None, (0, 5)])
+@pytest.mark.parametrize(("difficulty", "least"), [(0.0, 0.045), (0.5, 0.017), (1.0, 0.005)])
 def test_swinging_soles_clear_the_edges_of_the_stairs(
-    episodes: Callable, window: Callable, robot: Robot, difficulty: float, least: float
+    episodes: Callable, window: Callable, robot: Robot, difficulty: float, least: float, hold_after: tuple | None
 ) -> None:
-    drawn = episodes("stairs", difficulty)
+    drawn = episodes("stairs", difficulty, hold_after)
     assert (drawn.step.trigonometric == 0).all()  # those curves would pass through the tread between two others
     from_boxes, from_edges = clearances(robot, drawn, window(drawn))
     assert from_boxes.min() > -1e-5
     assert from_edges.min() > least
 
 
-def test_at_full_difficulty_a_sole_in_a_few_hundred_scrapes_an_edge(
-    episodes: Callable, window: Callable, robot: Robot
-) -> None:
-    """The lowest lifts over the highest risers, by a centimetre of the spheres' radius."""
-    drawn = episodes("stairs", 1.0)
-    assert (drawn.step.trigonometric == 0).all()
-    from_boxes, _ = clearances(robot, drawn, window(drawn))
-    assert from_boxes.min() > -0.015
-    assert (from_boxes < -1e-4).mean() < 0.005
+@pytest.mark.parametrize("rise", [0.1, -0.1])
+def test_edges_that_a_foot_passes_worked_by_hand(rise: float) -> None:
+    start, end = np.array([0.6, 0.1, 2.04]), np.array([1.2, 0.1, 2.04 + 2 * rise])
+    found = stair_edges(stairs(rise, 0.3, 2.0), start, end)
+    tops = [2.14, 2.24] if rise > 0 else [2.04, 1.94]
+    assert found == pytest.approx(np.array([[0.75, tops[0]], [1.05, tops[1]]]))
 
 
 # Boxes anywhere
