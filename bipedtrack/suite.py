@@ -103,7 +103,7 @@ def batch(name: str, ranges: sampling.Ranges, the_robot: robot.Robot, episodes: 
     plan = jax.tree.map(np.asarray, _lay_out(the_robot.name, steps)(jax.random.split(key, episodes), stacked))
     narrowed = ", ".join(f"{k} {list(v)}" for k, v in what.narrowed.items()) or "full ranges"
     if what.kind == "stairs":
-        narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m, feet lifted over the edges"
+        narrowed = f"risers {list(RISERS)} m x treads {list(TREADS)} m, feet lifted over edges"
     words = f"{what.kind}: {narrowed}" + (f"; hold after {HOLD_AFTER[0]}-{HOLD_AFTER[1]} task steps" if hold else "")
     words += "; swings run through uniformly" if "swing_ease" in what.narrowed else ""
     words += "; the trunk sways" if ranges.sway[2] > 0 else ""

@@ -251,7 +251,7 @@ def test_a_batch_says_in_words_what_it_is_drawn_from(drawn: Draw) -> None:
     words = {
         "stand": "stand: full ranges",
         "walk-backward": "walk: walk_step [-0.15, -0.03, -0.03]",
-        "stairs-up": "stairs: risers [0.05, 0.08, 0.11, 0.14, 0.17] m x treads [0.25, 0.3, 0.35] m, feet lifted over the edges",
+        "stairs-up": "stairs: risers [0.05, 0.08, 0.11, 0.14, 0.17] m x treads [0.25, 0.3, 0.35] m, feet lifted over edges",
         "hold-60s-turn-left": "turn: turn_yaw [0.05, 0.05, 0.35]; hold after 1-8 task steps",
     }
     assert {name: drawn(name).ranges for name in words} == words
