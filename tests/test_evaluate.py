@@ -68,7 +68,9 @@ class Runs(NamedTuple):
 
 RANDOM = ("--tasks", "walk-forward", "--episodes", "2", "--seconds", str(SECONDS))
 COMMANDS = Runs(
-    (str(FIRST), *RANDOM), ("zero", *RANDOM), (str(FIRST), "silent/best.npz", "--script", str(WALK), "--engine", "mujoco")
+    (str(FIRST), *RANDOM),
+    ("zero", *RANDOM, "--sway", str(policy.load(FIRST).sway)),
+    (str(FIRST), "silent/best.npz", "--script", str(WALK), "--engine", "mujoco"),
 )
 
 
