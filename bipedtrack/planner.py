@@ -189,9 +189,9 @@ def lift_over(start: Array, end: Array, lift: Array, along: Array, height: Array
     """
     xp = namespace(start)
     order = along.shape[0] + 1
-    s = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
-    k = np.arange(order + 1)
-    weights = xp.asarray(np.array([math.comb(order, i) for i in k]) * s**k * (1 - s) ** (order - k), dtype=start.dtype)
+    # each control point's share of each point of the curve
+    shares = np.array([bezier(np.eye(order + 1), s)[0] for s in np.linspace(0.0, 1.0, _SAMPLES)])
+    weights = xp.asarray(shares, dtype=start.dtype)
     curve = weights @ swing_points(start, end, lift, along, height)  # (2, samples, 3)
     per_metre = weights @ swing_points(xp.zeros_like(start), xp.zeros_like(end), xp.ones_like(lift), along, height)[..., 2:]
     near = xp.abs(curve[..., :1] - edges[:, None, :, 0]) < reach

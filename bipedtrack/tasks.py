@@ -251,11 +251,11 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     u = jax.random.uniform(key_curve, (2, 3))
     along = jnp.array([0.05, 0.5, 0.95]) + within(u[0], given.ranges["curve_along"])
     curve = {"along": along, "height": within(u[1], given.ranges["curve_height"])}
-    lift = motion.lift * vary[1]
+    lift = swing * motion.lift * vary[1]
     edges = terrain.stair_edges(task.stairs, start.ankle_positions, ankles) + jnp.array([0.0, _CLEARANCE])
     reach = 0.5 * robot.sole[0] + _MARGIN
-    over = planner.lift_over(start.ankle_positions, ankles, jnp.full(2, lift), **curve, edges=edges, reach=reach)
-    lift = swing * jnp.where(motion.kind == STAIRS, over, lift)
+    over = planner.lift_over(start.ankle_positions, ankles, lift, **curve, edges=edges, reach=reach)
+    lift = jnp.where(motion.kind == STAIRS, over, lift)
     points = planner.swing_points(start.ankle_positions, ankles, lift, **curve)
     return TaskStep(
         start=start,
