@@ -119,7 +119,7 @@ def _motion(key: Array, given: Distribution, level: bool) -> tuple[Motion, dict[
     )
     # the leading foot of a sidle is the one on the side it goes to
     first = jnp.where(kind == SIDLE, (draw["sidle_step"] < 0).astype(jnp.int32), (u[1] < 0.5).astype(jnp.int32))
-    height = _choose(kind == STAIRS, draw["stair_trunk_height"], draw["trunk_height"])
+    height = jnp.where(kind == STAIRS, draw["stair_trunk_height"], draw["trunk_height"])
     sway = jnp.clip(draw["sway"], 0.0, 1.0)
     return Motion(kind, advances[kind], first, draw["period"], draw["lift"], height, sway), draw
 
@@ -144,7 +144,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
         key=key_mix,
         break_every=jnp.where(breaks, jnp.floor(within(v[1], jnp.array(_BREAKS))), 1e6).astype(jnp.int32),
         pauses=v[2] < 0.5,
-        push=jnp.where(u[4] < given.push_share, _choose(on_stairs, ranges["stair_push"], ranges["push"])[1], 0.0),
+        push=jnp.where(u[4] < given.push_share, jnp.where(on_stairs, ranges["stair_push"], ranges["push"])[1], 0.0),
     )
 
     distance = jnp.where(still, draw["foot_distance"], FOOT_DISTANCE)
@@ -211,10 +211,6 @@ def _anywhere(key: Array, given: Distribution, outwards: Array) -> Array:
     return jnp.stack([draw["wander_x"] / beyond, outwards * draw["wander_y"] / beyond, draw["wander_yaw"]])
 
 
-def _choose(condition: Array, new: Array, old: Array) -> Array:
-    return jnp.where(condition, new, old)
-
-
 def next_step(key: Array, given: Distribution, task: Task, index: Array, start: Nodes, robot: Robot) -> TaskStep:
     """Task step number `index` of an episode, from where the last one ended; of a whole number of control periods."""
     key_step, key_curve, key_posture = jax.random.split(key, 3)
@@ -237,8 +233,8 @@ def next_step(key: Array, given: Distribution, task: Task, index: Array, start: 
     # a sidle's second foot closes up
     closes = breaks | ((motion.kind == SIDLE) & (swings != motion.first))
     footholds, headings = _foothold(motion, task.stairs.rise, closes, swings, advance, start)
-    ankles = _choose(steps, footholds, start.ankle_positions)
-    yaws = _choose(steps, headings, start.ankle_yaws)
+    ankles = jnp.where(steps, footholds, start.ankle_positions)
+    yaws = jnp.where(steps, headings, start.ankle_yaws)
     draw = sample(key_posture, (*_POSTURE, "squat_period", "trigonometric", "swing_ease"), given.ranges)
     period = jnp.where(squats, draw["squat_period"], period)
     drawn, upright = _drawn_posture(draw), _upright(motion.trunk_height)
