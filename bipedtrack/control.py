@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-from bipedtrack import kinematics, statics
+from bipedtrack import kinematics, rotations, statics
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame, stationary
 from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
@@ -14,6 +14,7 @@ from bipedtrack.rotations import Array, namespace
 
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
 INTEGRAL_SPEED = 0.3  # rad/s: it waits while any joint is faster
+BESIDE = 0.01  # m: a foot that rests so far from its foothold stays there
 INTEGRAL_FADES = 0.2  # s: with this time constant while the command moves
 
 
@@ -26,7 +27,7 @@ class ControlConfig:
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
     gravity_feedforward: bool = False  # adds the torques that hold the commanded posture up, over kp (`statics.load`)
-    integral: float = 0.0  # 1/s: adds that times the integral of (feedforward - joint angles) at rest
+    integral: float = 0.0  # 1/s: adds that times the integral of (`feedforward_in_place` - joint angles) at rest
 
     def __post_init__(self) -> None:
         if not 0 < self.filter <= 1:
@@ -42,7 +43,7 @@ class ControlState(NamedTuple):
 
     filtered: Array  # (12,) u_{t-1} of eq (7), in [-1, 1]
     feedforward: Array  # (12,) a_ff of the last control step
-    integral: Array  # (12,) of a_ff minus the measured joint angles, times its gain, in half ranges
+    integral: Array  # (12,) of `feedforward_in_place` minus the measured joint angles, times its gain, in half ranges
 
 
 def feedforward(robot: Robot, settings: ControlConfig, target: Nodes) -> Array:
@@ -80,8 +81,25 @@ def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
     return ControlState(xp.clip(standing, -1.0, 1.0), standing if a_ff is None else a_ff, xp.zeros_like(standing))
 
 
+def feedforward_in_place(robot: Robot, settings: ControlConfig, target: Nodes, qpos: Array) -> Array:
+    """(12,) normalised joint angles that carry the target's trunk on the feet where they stand, at qpos (19,).
+
+    The feedforward, but where an ankle is `BESIDE` off its target or more it is wanted where it is, with its yaw: such a
+    foot can only be dragged to its foothold, by a robot that leans on it. Up to half of that it is put right.
+    """
+    xp = namespace(qpos)
+    real = kinematics.measure(robot, qpos)
+    off = real.ankle_positions - target.ankle_positions
+    share = xp.clip(2 * xp.sqrt((off * off).sum(axis=-1)) / BESIDE - 1, 0.0, 1.0)
+    turned = rotations.wrap(real.ankle_yaws - target.ankle_yaws)
+    ankles = target.ankle_positions + share[:, None] * off
+    return feedforward(
+        robot, settings, target._replace(ankle_positions=ankles, ankle_yaws=target.ankle_yaws + share * turned)
+    )
+
+
 def integrate(
-    robot: Robot, settings: ControlConfig, state: ControlState, a_ff: Array, joints: Array, velocities: Array, rests: Array
+    robot: Robot, settings: ControlConfig, state: ControlState, wanted: Array, joints: Array, velocities: Array, rests: Array
 ) -> ControlState:
     """The state with its integral one control step on. Not in the paper.
 
@@ -91,13 +109,13 @@ def integrate(
 
     Args:
       state: after the last control step.
-      a_ff: (12,) feedforward of this one.
+      wanted: (12,) joint angles without an error, normalised.
       joints: (12,) measured joint angles, rad.
       velocities: (12,) of the joints, rad/s.
       rests: () bool, whether the command stands still.
     """
-    xp = namespace(a_ff)
-    grown = state.integral + settings.integral * robot.timestep * (a_ff - normalize(robot, joints))
+    xp = namespace(wanted)
+    grown = state.integral + settings.integral * robot.timestep * (wanted - normalize(robot, joints))
     at_rest = xp.all(xp.abs(velocities) < INTEGRAL_SPEED)
     kept = xp.where(at_rest, xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT), state.integral)
     return state._replace(integral=xp.where(rests, kept, state.integral * (1 - robot.timestep / INTEGRAL_FADES)))
@@ -134,19 +152,20 @@ def respond(
     a_ff: Array,
     a_fb: Array,
     command: Command,
-    joints: Array,
-    velocities: Array,
+    qpos: Array,
+    qvel: Array,
 ) -> tuple[Array, ControlState]:
-    """The whole law of a control step: `integrate` and the load of the commanded posture if asked for, `joint_targets`.
+    """The whole law of a control step: the integral and the load of the commanded posture if asked for, `joint_targets`.
 
     Args:
       state: after the last control step.
       a_ff, a_fb: (12,) feedforward and feedback in [-1, 1].
       command: of this instant.
-      joints, velocities: (12,) measured, rad and rad/s.
+      qpos, qvel: (19,) and (18,), MuJoCo's state of the robot.
     """
     if settings.integral:
-        state = integrate(robot, settings, state, a_ff, joints, velocities, stationary(command.rates))
+        wanted = feedforward_in_place(robot, settings, command.target, qpos)
+        state = integrate(robot, settings, state, wanted, qpos[7:], qvel[6:], stationary(command.rates))
     load = None
     if settings.gravity_feedforward:
         posture = denormalize(robot, a_ff)

@@ -251,7 +251,7 @@ class TrackingEnv(brax.envs.Env):
         command = self.command(episode)
         a_ff = control.feedforward(self.robot, self.config.control, self.feedforward_nodes(episode, command))
         targets, memory = control.respond(
-            self.robot, self.config.control, episode.control, a_ff, a_fb, command, physics.qpos[7:], physics.qvel[6:]
+            self.robot, self.config.control, episode.control, a_ff, a_fb, command, physics.qpos, physics.qvel
         )
         physics = self.simulate(physics, targets, episode.push)
         episode = self._tick(episode._replace(control=memory), following)

@@ -72,7 +72,7 @@ class Evaluate:
     integral: float | None = None
     """Another gain of the joints' integral at rest, 1/s; 0: none."""
     feedforward: bool = True
-    """--no-feedforward: the feedforward stays at the first command's."""
+    """--no-feedforward: the feedforward stays at the first command's; an integral aims at the present one still."""
 
 
 @dataclasses.dataclass(frozen=True)

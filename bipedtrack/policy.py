@@ -291,9 +291,9 @@ class Controller:
             self._memory = control.initial(self._standing, a_ff)
         if self.uses_feedback and self._tick % self._hold == 0:
             self._feedback = self.policy.feedback(self._observe(qpos, qvel, command, a_ff))
-        joints, velocities = np.asarray(qpos, np.float32)[7:], np.asarray(qvel, np.float32)[6:]
+        state = np.asarray(qpos, np.float32), np.asarray(qvel, np.float32)
         targets, self._memory = control.respond(
-            self.robot, self.policy.settings, self._memory, a_ff, self._feedback, command, joints, velocities
+            self.robot, self.policy.settings, self._memory, a_ff, self._feedback, command, *state
         )
         self._tick += 1
         return targets

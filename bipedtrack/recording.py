@@ -141,9 +141,7 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
         seen = observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, memory.feedback))
         fresh = jnp.clip(controls.settings.feedback_scale * controls.act(seen), -1.0, 1.0)
         a_fb = jnp.where(think, fresh, memory.feedback)
-        targets, state = control.respond(
-            the_robot, controls.settings, memory.control, a_ff, a_fb, command, qpos[7:], qvel[6:]
-        )
+        targets, state = control.respond(the_robot, controls.settings, memory.control, a_ff, a_fb, command, qpos, qvel)
         return targets, _Memory(state, a_fb), command.target, command.timer, stationary(command.rates)
 
     start = jax.jit(jax.vmap(lambda plan: _start(the_robot, controls.settings, plan)))

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bipedtrack import control
+from bipedtrack import control, footsteps, kinematics
 from bipedtrack.control import ControlConfig
-from bipedtrack.nodes import Nodes
+from bipedtrack.nodes import NodeRates, Nodes
+from bipedtrack.planner import Command
 from bipedtrack.robot import Robot, build_model
 
 KNEE, RIGHT_ANKLE_ROLL = 3, 11
@@ -212,6 +213,66 @@ def test_feedforward_of_a_target_out_of_reach_stays_within_the_ranges(
     target = standing(roll=0.3)._replace(ankle_positions=np.reshape(numbers, (2, 3)))
     a_ff = control.feedforward(robot, ControlConfig(level_feet=level_feet), target)
     assert (np.abs(a_ff) <= 1 + 1e-6).all()
+
+
+def state_with_a_foot_beside_its_foothold(robot: Robot, settings: ControlConfig) -> tuple[Nodes, np.ndarray]:
+    """A target, and qpos (19,) of a robot whose trunk is at it, its left foot 3 cm and 0.2 rad off."""
+    target = footsteps.balanced(robot, standing(at=(1.0, 2.0), yaw=0.5), np.array([1.0, 2.0]))
+    ankles, yaws = target.ankle_positions.copy(), target.ankle_yaws.copy()
+    ankles[0, :2] += 0.024, 0.018
+    yaws[0] += 0.2
+    beside = control.feedforward(robot, settings, target._replace(ankle_positions=ankles, ankle_yaws=yaws))
+    return target, np.concatenate([target.trunk_position, target.trunk_orientation, control.denormalize(robot, beside)])
+
+
+def test_feedforward_in_place_puts_the_trunk_on_its_target_and_leaves_the_feet(
+    robot: Robot, mj_model: mujoco.MjModel
+) -> None:
+    settings, data = ControlConfig(level_feet=True), mujoco.MjData(mj_model)
+    target, qpos = state_with_a_foot_beside_its_foothold(robot, settings)
+    # the trunk leaves its target with the soles on the ground: the legs follow it
+    feet = target._replace(ankle_positions=kinematics.measure(robot, qpos).ankle_positions, ankle_yaws=np.array([0.7, 0.5]))
+    sunk = feet._replace(
+        trunk_position=feet.trunk_position - [0.02, 0.01, 0.03],
+        trunk_orientation=Rotation.from_euler("xyz", [0.05, 0.1, 0.6]).as_quat(scalar_first=True),
+    )
+    joints = control.denormalize(robot, control.feedforward(robot, settings, sunk))
+    data.qpos[:] = np.concatenate([sunk.trunk_position, sunk.trunk_orientation, joints])
+    wanted = control.feedforward_in_place(robot, settings, target, data.qpos)
+    places = []
+    for trunk, angles in ((sunk, joints), (target, control.denormalize(robot, wanted))):
+        data.qpos[:] = np.concatenate([trunk.trunk_position, trunk.trunk_orientation, angles])
+        mujoco.mj_kinematics(mj_model, data)
+        places.append([(data.body(foot).xpos.copy(), data.body(foot).xmat.copy()) for foot in ("left_foot", "right_foot")])
+    (left, right), (left_wanted, right_wanted) = places
+    assert left_wanted[0] == pytest.approx(left[0], abs=1e-9)
+    assert left_wanted[1] == pytest.approx(left[1], abs=1e-9)  # level, and 0.2 rad off its target
+    assert right_wanted[0] == pytest.approx(right[0], abs=1e-9)
+    # the foot that is at its foothold is put right: what the tilt of the trunk turned it by
+    assert np.arctan2(right_wanted[1][3], right_wanted[1][0]) == pytest.approx(0.5, abs=1e-9)
+    assert np.arctan2(right[1][3], right[1][0]) != pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_integral_brings_the_trunk_to_its_target_with_a_foot_beside_its_foothold(
+    robot: Robot, mj_model: mujoco.MjModel
+) -> None:
+    """MuJoCo's robot stands for 10 s without a network; aimed at the foothold, the trunk would stay 1.3 cm off."""
+    settings = ControlConfig(level_feet=True, gravity_feedforward=True, integral=0.5)
+    target, start = state_with_a_foot_beside_its_foothold(robot, settings)
+    still = NodeRates(*(np.zeros(shape) for shape in ((3,), (3,), (2, 3), (2,))))
+    command = Command(target, target, still, np.zeros(2))
+    a_ff = control.feedforward(robot, settings, target)
+    data, state = mujoco.MjData(mj_model), control.initial(control.normalize(robot, start[7:]), a_ff)
+    data.qpos[:] = start
+    for tick in range(2000):
+        data.ctrl[:], state = control.respond(robot, settings, state, a_ff, ZERO, command, data.qpos, data.qvel)
+        mujoco.mj_step(mj_model, data)
+        if tick == 1000:
+            before = kinematics.measure(robot, data.qpos.copy())
+    after = kinematics.measure(robot, data.qpos)
+    assert after.trunk_position == pytest.approx(target.trunk_position, abs=0.003)
+    assert after.ankle_positions == pytest.approx(before.ankle_positions, abs=0.003)
+    assert np.linalg.norm(after.ankle_positions[0] - target.ankle_positions[0]) > 0.015
 
 
 def test_jax_gives_numpys_joint_targets(robot: Robot) -> None:

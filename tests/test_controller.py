@@ -103,7 +103,7 @@ def follow(env, state, step, seconds):
         largest_feedback = max(largest_feedback, np.abs(after.feedback).max())
         if env.substeps == 1:
             a_ff = after.control.feedforward
-            seen = (now, physics.qpos[7:], physics.qvel[6:])
+            seen = (now, physics.qpos, physics.qvel)
             wanted, _ = control.respond(robot32, env.config.control, episode.control, a_ff, after.feedback, *seen)
         else:
             assert not env.config.control.velocity_feedforward

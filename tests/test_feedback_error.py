@@ -59,8 +59,8 @@ def test_descending_it_makes_a_robot_stand_where_it_should(robot: Robot, mj_mode
         for step in range(32):
             for _ in range(4):
                 feedback = settings.feedback_scale * action
-                joints = data.qpos[7:], data.qvel[6:]
-                data.ctrl[:], state = control.respond(robot, settings, state, a_ff, feedback, command, *joints)
+                now = data.qpos, data.qvel
+                data.ctrl[:], state = control.respond(robot, settings, state, a_ff, feedback, command, *now)
                 mujoco.mj_step(mj_model, data)
             flat[0, step, PARTS["joint_positions"]] = data.qpos[7:]
         missed.append(100 * np.linalg.norm(data.qpos[:3] - nodes.trunk_position))

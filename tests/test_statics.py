@@ -73,9 +73,7 @@ def test_with_it_a_robot_without_feedback_stands_where_it_should(robot: Robot, m
         data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, control.denormalize(robot, a_ff)])
         state = control.initial(a_ff)
         for _ in range(400):
-            data.ctrl[:], state = control.respond(
-                robot, settings, state, a_ff, np.zeros(12), command, data.qpos[7:], data.qvel[6:]
-            )
+            data.ctrl[:], state = control.respond(robot, settings, state, a_ff, np.zeros(12), command, data.qpos, data.qvel)
             mujoco.mj_step(mj_model, data)
         missed.append(100 * np.linalg.norm(data.qpos[:3] - nodes.trunk_position))
     assert missed[0] > 1.0 and missed[1] < 0.5  # cm
