@@ -14,8 +14,8 @@ from bipedtrack.rotations import Array, namespace
 
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
 INTEGRAL_SPEED = 0.3  # rad/s: it waits while any joint is faster
-BESIDE = 0.01  # m: a foot that rests so far from its foothold stays there
 INTEGRAL_FADES = 0.2  # s: with this time constant while the command moves
+BESIDE = 0.01  # m: a foot that rests so far from its foothold stays there
 
 
 @dataclasses.dataclass(frozen=True)

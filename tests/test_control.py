@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from commands import still
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bipedtrack import control, footsteps, kinematics
 from bipedtrack.control import ControlConfig
-from bipedtrack.nodes import NodeRates, Nodes
-from bipedtrack.planner import Command
+from bipedtrack.nodes import Nodes
 from bipedtrack.robot import Robot, build_model
 
 KNEE, RIGHT_ANKLE_ROLL = 3, 11
@@ -225,7 +225,7 @@ def state_with_a_foot_beside_its_foothold(robot: Robot, settings: ControlConfig)
     return target, np.concatenate([target.trunk_position, target.trunk_orientation, control.denormalize(robot, beside)])
 
 
-def test_feedforward_in_place_puts_the_trunk_on_its_target_and_leaves_the_feet(
+def test_feedforward_in_place_puts_the_trunk_on_its_target_and_leaves_a_foot_beside_its_foothold(
     robot: Robot, mj_model: mujoco.MjModel
 ) -> None:
     settings, data = ControlConfig(level_feet=True), mujoco.MjData(mj_model)
@@ -259,9 +259,7 @@ def test_the_integral_brings_the_trunk_to_its_target_with_a_foot_beside_its_foot
     """MuJoCo's robot stands for 10 s without a network; aimed at the foothold, the trunk would stay 1.3 cm off."""
     settings = ControlConfig(level_feet=True, gravity_feedforward=True, integral=0.5)
     target, start = state_with_a_foot_beside_its_foothold(robot, settings)
-    still = NodeRates(*(np.zeros(shape) for shape in ((3,), (3,), (2, 3), (2,))))
-    command = Command(target, target, still, np.zeros(2))
-    a_ff = control.feedforward(robot, settings, target)
+    command, a_ff = still(target), control.feedforward(robot, settings, target)
     data, state = mujoco.MjData(mj_model), control.initial(control.normalize(robot, start[7:]), a_ff)
     data.qpos[:] = start
     for tick in range(2000):

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from commands import still
 
 from bipedtrack import control, feedback_error, footsteps, observation
 from bipedtrack.control import ControlConfig
-from bipedtrack.nodes import NodeRates, Nodes
-from bipedtrack.planner import Command
+from bipedtrack.nodes import Nodes
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import from_euler
 
@@ -50,7 +50,7 @@ def test_descending_it_makes_a_robot_stand_where_it_should(robot: Robot, mj_mode
     nodes = Nodes(np.array([0.0, 0.0, 0.7]), from_euler(0.0, 0.1, 0.0), ankles, np.zeros(2))
     nodes = footsteps.balanced(robot, nodes, np.array([0.03, 0.01]))
     a_ff = control.feedforward(robot, settings, nodes)
-    command = Command(nodes, nodes, NodeRates(*(np.zeros(shape) for shape in ((3,), (3,), (2, 3), (2,)))), np.zeros(2))
+    command = still(nodes)
     data, state, action, missed = mujoco.MjData(mj_model), control.initial(a_ff), np.zeros(12), []
     data.qpos[:] = np.concatenate([nodes.trunk_position, nodes.trunk_orientation, control.denormalize(robot, a_ff)])
     for _ in range(16):

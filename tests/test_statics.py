@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from commands import still
 
 from bipedtrack import control, footsteps, statics
 from bipedtrack.control import ControlConfig
-from bipedtrack.nodes import NodeRates, Nodes
-from bipedtrack.planner import Command
+from bipedtrack.nodes import Nodes
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import from_euler
 
@@ -65,7 +65,7 @@ def test_torques_are_those_of_mujocos_gravity_and_jacobians(
 @pytest.mark.parametrize("seed", range(3))
 def test_with_it_a_robot_without_feedback_stands_where_it_should(robot: Robot, mj_model: mujoco.MjModel, seed: int) -> None:
     nodes = posture(robot, seed)
-    command = Command(nodes, nodes, NodeRates(*(np.zeros(shape) for shape in ((3,), (3,), (2, 3), (2,)))), np.zeros(2))
+    command = still(nodes)
     missed = []
     for gravity_feedforward in (False, True):
         settings, data = ControlConfig(level_feet=True, gravity_feedforward=gravity_feedforward), mujoco.MjData(mj_model)
