@@ -15,7 +15,6 @@ from bipedtrack.rotations import Array, namespace
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
 INTEGRAL_SPEED = 0.3  # rad/s: it waits while any joint is faster
 INTEGRAL_FADES = 0.2  # s: with this time constant while the command moves
-BESIDE = 0.01  # m: a foot that rests so far from its foothold stays there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +26,7 @@ class ControlConfig:
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
     gravity_feedforward: bool = False  # adds the torques that hold the commanded posture up, over kp (`statics.load`)
-    integral: float = 0.0  # 1/s: adds that times the integral of (`feedforward_in_place` - joint angles) at rest
+    integral: float = 0.0  # 1/s: adds that times the integral of what the joints lack at rest (`integrate`)
 
     def __post_init__(self) -> None:
         if not 0 < self.filter <= 1:
@@ -43,7 +42,8 @@ class ControlState(NamedTuple):
 
     filtered: Array  # (12,) u_{t-1} of eq (7), in [-1, 1]
     feedforward: Array  # (12,) a_ff of the last control step
-    integral: Array  # (12,) of `feedforward_in_place` minus the measured joint angles, times its gain, in half ranges
+    integral: Array  # (12,) of what the joints lack at rest, times its gain, in half ranges
+    beside: Array  # (2, 4) m and rad: how far off their targets the feet came to rest (`anchor`)
 
 
 def feedforward(robot: Robot, settings: ControlConfig, target: Nodes) -> Array:
@@ -78,24 +78,38 @@ def initial(standing: Array, a_ff: Array | None = None) -> ControlState:
     a_ff: the feedforward of the first command, (12,), where it is another; the velocity feedforward begins at zero.
     """
     xp = namespace(standing)
-    return ControlState(xp.clip(standing, -1.0, 1.0), standing if a_ff is None else a_ff, xp.zeros_like(standing))
+    return ControlState(
+        xp.clip(standing, -1.0, 1.0),
+        standing if a_ff is None else a_ff,
+        xp.zeros_like(standing),
+        xp.zeros((2, 4), dtype=standing.dtype),
+    )
 
 
-def feedforward_in_place(robot: Robot, settings: ControlConfig, target: Nodes, qpos: Array) -> Array:
-    """(12,) normalised joint angles that carry the target's trunk on the feet where they stand, at qpos (19,).
+def anchor(
+    robot: Robot, state: ControlState, target: Nodes, qpos: Array, velocities: Array, rests: Array
+) -> tuple[Nodes, ControlState]:
+    """The target with its feet where they came to rest, at first at their footholds, and the state. Not in the paper.
 
-    The feedforward, but where an ankle is `BESIDE` off its target or more it is wanted where it is, with its yaw: such a
-    foot can only be dragged to its foothold, by a robot that leans on it. Up to half of that it is put right.
+    A foot that rests beside its foothold could only be dragged there, by a robot that leans on it; one that creeps away from
+    where it came to rest is brought back.
+
+    Args:
+      state: after the last control step.
+      target: of this instant.
+      qpos: (19,), MuJoCo's.
+      velocities: (12,) of the joints, rad/s.
+      rests: () bool, whether the command stands still.
     """
     xp = namespace(qpos)
     real = kinematics.measure(robot, qpos)
-    off = real.ankle_positions - target.ankle_positions
-    share = xp.clip(2 * xp.sqrt((off * off).sum(axis=-1)) / BESIDE - 1, 0.0, 1.0)
     turned = rotations.wrap(real.ankle_yaws - target.ankle_yaws)
-    ankles = target.ankle_positions + share[:, None] * off
-    return feedforward(
-        robot, settings, target._replace(ankle_positions=ankles, ankle_yaws=target.ankle_yaws + share * turned)
+    here = xp.concat([real.ankle_positions - target.ankle_positions, turned[:, None]], axis=-1)
+    beside = xp.where(rests & _is_slow(velocities), state.beside, here)
+    moved = target._replace(
+        ankle_positions=target.ankle_positions + beside[:, :3], ankle_yaws=target.ankle_yaws + beside[:, 3]
     )
+    return moved, state._replace(beside=beside)
 
 
 def integrate(
@@ -116,9 +130,14 @@ def integrate(
     """
     xp = namespace(wanted)
     grown = state.integral + settings.integral * robot.timestep * (wanted - normalize(robot, joints))
-    at_rest = xp.all(xp.abs(velocities) < INTEGRAL_SPEED)
-    kept = xp.where(at_rest, xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT), state.integral)
+    kept = xp.where(_is_slow(velocities), xp.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT), state.integral)
     return state._replace(integral=xp.where(rests, kept, state.integral * (1 - robot.timestep / INTEGRAL_FADES)))
+
+
+def _is_slow(velocities: Array) -> Array:
+    """() bool: whether every joint is slower than `INTEGRAL_SPEED`."""
+    xp = namespace(velocities)
+    return xp.all(xp.abs(velocities) < INTEGRAL_SPEED)
 
 
 def joint_targets(
@@ -142,7 +161,7 @@ def joint_targets(
         )
         low, high = (xp.asarray(v, dtype=a_ff.dtype) for v in (robot.joint_low, robot.joint_high))
         targets = xp.clip(targets + lag * half * (a_ff - state.feedforward), low, high)
-    return targets, ControlState(filtered, a_ff, state.integral)
+    return targets, state._replace(filtered=filtered, feedforward=a_ff)
 
 
 def respond(
@@ -164,8 +183,10 @@ def respond(
       qpos, qvel: (19,) and (18,), MuJoCo's state of the robot.
     """
     if settings.integral:
-        wanted = feedforward_in_place(robot, settings, command.target, qpos)
-        state = integrate(robot, settings, state, wanted, qpos[7:], qvel[6:], stationary(command.rates))
+        rests = stationary(command.rates)
+        target, state = anchor(robot, state, command.target, qpos, qvel[6:], rests)
+        wanted = feedforward(robot, settings, target)
+        state = integrate(robot, settings, state, wanted, qpos[7:], qvel[6:], rests)
     load = None
     if settings.gravity_feedforward:
         posture = denormalize(robot, a_ff)

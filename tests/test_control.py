@@ -225,32 +225,42 @@ def state_with_a_foot_beside_its_foothold(robot: Robot, settings: ControlConfig)
     return target, np.concatenate([target.trunk_position, target.trunk_orientation, control.denormalize(robot, beside)])
 
 
-def test_feedforward_in_place_puts_the_trunk_on_its_target_and_leaves_a_foot_beside_its_foothold(
+def feet_in_mujoco(mj_model: mujoco.MjModel, qpos: np.ndarray) -> list[np.ndarray]:
+    """Place (3,) and orientation (9,) of the left and the right foot."""
+    data = mujoco.MjData(mj_model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(mj_model, data)
+    return [part for foot in ("left_foot", "right_foot") for part in (data.body(foot).xpos, data.body(foot).xmat)]
+
+
+def test_anchor_keeps_the_feet_where_they_were_when_command_and_robot_last_moved(
     robot: Robot, mj_model: mujoco.MjModel
 ) -> None:
-    settings, data = ControlConfig(level_feet=True), mujoco.MjData(mj_model)
-    target, qpos = state_with_a_foot_beside_its_foothold(robot, settings)
-    # the trunk leaves its target with the soles on the ground: the legs follow it
-    feet = target._replace(ankle_positions=kinematics.measure(robot, qpos).ankle_positions, ankle_yaws=np.array([0.7, 0.5]))
-    sunk = feet._replace(
-        trunk_position=feet.trunk_position - [0.02, 0.01, 0.03],
-        trunk_orientation=Rotation.from_euler("xyz", [0.05, 0.1, 0.6]).as_quat(scalar_first=True),
-    )
-    joints = control.denormalize(robot, control.feedforward(robot, settings, sunk))
-    data.qpos[:] = np.concatenate([sunk.trunk_position, sunk.trunk_orientation, joints])
-    wanted = control.feedforward_in_place(robot, settings, target, data.qpos)
-    places = []
-    for trunk, angles in ((sunk, joints), (target, control.denormalize(robot, wanted))):
-        data.qpos[:] = np.concatenate([trunk.trunk_position, trunk.trunk_orientation, angles])
-        mujoco.mj_kinematics(mj_model, data)
-        places.append([(data.body(foot).xpos.copy(), data.body(foot).xmat.copy()) for foot in ("left_foot", "right_foot")])
-    (left, right), (left_wanted, right_wanted) = places
-    assert left_wanted[0] == pytest.approx(left[0], abs=1e-9)
-    assert left_wanted[1] == pytest.approx(left[1], abs=1e-9)  # level, and 0.2 rad off its target
-    assert right_wanted[0] == pytest.approx(right[0], abs=1e-9)
-    # the foot that is at its foothold is put right: what the tilt of the trunk turned it by
-    assert np.arctan2(right_wanted[1][3], right_wanted[1][0]) == pytest.approx(0.5, abs=1e-9)
-    assert np.arctan2(right[1][3], right[1][0]) != pytest.approx(0.5, abs=1e-3)
+    settings, fast = ControlConfig(level_feet=True), np.where(np.arange(12) == KNEE, 0.31, 0.0)
+    target, start = state_with_a_foot_beside_its_foothold(robot, settings)
+    rests, moves = np.array(True), np.array(False)
+    first, began = control.anchor(robot, control.initial(ZERO), target, start, ZERO, rests)
+    assert [*first.ankle_positions.flat, *began.beside.flat] == pytest.approx([*target.ankle_positions.flat, *[0.0] * 8])
+    for velocities, still_there in ((ZERO, moves), (fast, rests), (fast, moves)):
+        _, state = control.anchor(robot, began, target, start, velocities, still_there)
+        assert state.beside == pytest.approx(np.array([[0.024, 0.018, 0, 0.2], [0, 0, 0, 0]]), abs=1e-9)
+        # the trunk leaves its target, and the feet creep
+        crept = np.concatenate([start[:3] + [0.02, 0.01, -0.03], start[3:7], start[7:] + 0.01])
+        wanted, kept = control.anchor(robot, state, target, crept, ZERO, rests)
+        assert kept.beside == pytest.approx(state.beside, abs=0)
+        joints = control.denormalize(robot, control.feedforward(robot, settings, wanted))
+        placed = feet_in_mujoco(mj_model, np.concatenate([target.trunk_position, target.trunk_orientation, joints]))
+        for found, expected in zip(placed, feet_in_mujoco(mj_model, start), strict=True):
+            assert found == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("turned", [-0.1, 0.1])
+def test_anchor_measures_a_foots_turn_the_short_way_round(robot: Robot, turned: float) -> None:
+    _, start = state_with_a_foot_beside_its_foothold(robot, ControlConfig())
+    target = kinematics.measure(robot, start)
+    target = target._replace(ankle_yaws=target.ankle_yaws - turned + 2 * math.pi)
+    _, state = control.anchor(robot, control.initial(ZERO), target, start, ZERO, np.array(False))
+    assert state.beside[:, 3] == pytest.approx([turned, turned])
 
 
 def test_the_integral_brings_the_trunk_to_its_target_with_a_foot_beside_its_foothold(
@@ -259,17 +269,19 @@ def test_the_integral_brings_the_trunk_to_its_target_with_a_foot_beside_its_foot
     """MuJoCo's robot stands for 10 s without a network; aimed at the foothold, the trunk would stay 1.3 cm off."""
     settings = ControlConfig(level_feet=True, gravity_feedforward=True, integral=0.5)
     target, start = state_with_a_foot_beside_its_foothold(robot, settings)
-    command, a_ff = still(target), control.feedforward(robot, settings, target)
+    a_ff, stands = control.feedforward(robot, settings, target), still(target)
+    arrives = stands._replace(rates=jax.tree.map(np.ones_like, stands.rates))
     data, state = mujoco.MjData(mj_model), control.initial(control.normalize(robot, start[7:]), a_ff)
     data.qpos[:] = start
     for tick in range(2000):
+        command = stands if tick else arrives
         data.ctrl[:], state = control.respond(robot, settings, state, a_ff, ZERO, command, data.qpos, data.qvel)
         mujoco.mj_step(mj_model, data)
         if tick == 1000:
             before = kinematics.measure(robot, data.qpos.copy())
     after = kinematics.measure(robot, data.qpos)
-    assert after.trunk_position == pytest.approx(target.trunk_position, abs=0.003)
-    assert after.ankle_positions == pytest.approx(before.ankle_positions, abs=0.003)
+    assert after.trunk_position == pytest.approx(target.trunk_position, abs=0.001)
+    assert after.ankle_positions == pytest.approx(before.ankle_positions, abs=0.002)
     assert np.linalg.norm(after.ankle_positions[0] - target.ankle_positions[0]) > 0.015
 
 
@@ -277,23 +289,27 @@ def test_jax_gives_numpys_joint_targets(robot: Robot) -> None:
     single = robot.cast(np.float32)
     settings = ControlConfig(level_feet=True, velocity_feedforward=True, integral=1.0)
     random = np.random.default_rng(0)
-    targets = []
-    for _ in range(200):
+    joints = random.uniform(robot.joint_low, robot.joint_high, (200, 12)).astype(np.float32)
+    qvel = random.uniform(-1, 1, (200, 18)).astype(np.float32)
+    qvel[::3] *= 0.3  # slow enough to rest
+    commands, qpos = [], []
+    for n in range(200):
         roll, pitch, yaw, *at = random.uniform(-0.3, 0.3, 5)
         target = standing(roll, pitch, yaw, tuple(at))
-        targets.append(target._replace(ankle_positions=target.ankle_positions + random.uniform(-0.1, 0.1, (2, 3))))
-    targets = jax.tree.map(lambda x: np.asarray(x, np.float32), targets)
+        target = target._replace(ankle_positions=target.ankle_positions + random.uniform(-0.1, 0.1, (2, 3)))
+        rests = still(target)
+        commands.append(rests._replace(rates=jax.tree.map(lambda x, share=n % 2: x + share, rests.rates)))
+        qpos.append(np.concatenate([target.trunk_position, target.trunk_orientation, joints[n]], dtype=np.float32))
+    commands = jax.tree.map(lambda x: np.asarray(x, np.float32), commands)
     before, a_fb = random.uniform(-1, 1, (2, 200, 12)).astype(np.float32)
 
-    def run(target: Nodes, before: Any, a_fb: Any, rests: Any) -> tuple:
-        a_ff = control.feedforward(single, settings, target)
-        state = control.initial(before)._replace(integral=0.1 * a_fb)
-        state = control.integrate(single, settings, state, a_ff, single.joint_middle, 0.5 * a_fb, rests)
-        return a_ff, *control.joint_targets(single, settings, state, a_ff, a_fb)
+    def run(command: Any, qpos: Any, qvel: Any, before: Any, a_fb: Any) -> tuple:
+        a_ff = control.feedforward(single, settings, command.target)
+        state = control.initial(before)._replace(integral=0.1 * a_fb, beside=0.1 * before[:8].reshape(2, 4))
+        return a_ff, *control.respond(single, settings, state, a_ff, a_fb, command, qpos, qvel)
 
-    rests = np.arange(200) % 2 == 0
-    in_jax = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *targets), before, a_fb, rests)
-    in_numpy = jax.tree.map(lambda *x: np.stack(x), *map(run, targets, before, a_fb, rests))
+    in_jax = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *commands), np.stack(qpos), qvel, before, a_fb)
+    in_numpy = jax.tree.map(lambda *x: np.stack(x), *map(run, commands, qpos, qvel, before, a_fb))
     # the velocity feedforward differentiates: kd/kp over 5 ms multiplies the rounding by ten
     for found, expected in zip(jax.tree.leaves(in_jax), jax.tree.leaves(in_numpy), strict=True):
         assert found.dtype == expected.dtype == np.float32
