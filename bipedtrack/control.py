@@ -13,7 +13,7 @@ from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
-INTEGRAL_SPEED = 0.3  # rad/s: it waits while any joint is faster
+INTEGRAL_SPEED = 0.3  # rad/s: while any joint is faster the integral waits, and `anchor` measures the feet anew
 INTEGRAL_FADES = 0.2  # s: with this time constant while the command moves
 
 

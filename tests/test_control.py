@@ -241,8 +241,8 @@ def test_anchor_keeps_the_feet_where_they_were_when_command_and_robot_last_moved
     rests, moves = np.array(True), np.array(False)
     first, began = control.anchor(robot, control.initial(ZERO), target, start, ZERO, rests)
     assert [*first.ankle_positions.flat, *began.beside.flat] == pytest.approx([*target.ankle_positions.flat, *[0.0] * 8])
-    for velocities, still_there in ((ZERO, moves), (fast, rests), (fast, moves)):
-        _, state = control.anchor(robot, began, target, start, velocities, still_there)
+    for velocities, told in ((ZERO, moves), (fast, rests), (fast, moves)):
+        _, state = control.anchor(robot, began, target, start, velocities, told)
         assert state.beside == pytest.approx(np.array([[0.024, 0.018, 0, 0.2], [0, 0, 0, 0]]), abs=1e-9)
         # the trunk leaves its target, and the feet creep
         crept = np.concatenate([start[:3] + [0.02, 0.01, -0.03], start[3:7], start[7:] + 0.01])
