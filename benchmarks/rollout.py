@@ -113,7 +113,7 @@ def environment(the_env: TrackingEnv, driven: policy.Policy | None, robots: int,
 def main(options: Rollout) -> None:
     """Prints a line for every case."""
     devices = measure.use_devices(options.devices)
-    driven = policy.load(options.policy, robot.load())
+    driven = policy.load_for_simulation(options.policy)
     plan = curriculum.load("best")
     plan = dataclasses.replace(plan, control=driven.settings, policy_period=driven.policy_period)
     model = robot.build_model(driven.robot.name)

@@ -17,7 +17,7 @@ import measure
 import rollout
 import tyro
 
-from bipedtrack import autoreset, curriculum, policy, robot, training
+from bipedtrack import autoreset, curriculum, policy, training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ def main(options: Training) -> None:
     the_env = training.make_env(config, stage, call.lesson)
     robots, steps = config.ppo.num_envs, config.ppo.unroll_length * the_env.substeps
 
-    driven = policy.load(options.policy, robot.load())
+    driven = policy.load_for_simulation(options.policy)
     physics = rollout.mjx_alone(the_env, robots, steps, devices).rate / the_env.substeps
     environment = rollout.environment(the_env, None, robots, steps, devices).rate / the_env.substeps
     with_policy = rollout.environment(the_env, driven, robots, steps, devices).rate / the_env.substeps

@@ -15,6 +15,7 @@ import numpy as np
 
 from bipedtrack import (
     control,
+    falls,
     footholds,
     footsteps,
     kinematics,
@@ -33,10 +34,6 @@ from bipedtrack.planner import TaskStep
 from bipedtrack.robot import LEGS
 from bipedtrack.steering import Planned, Steering, Wishes
 
-# When a robot counts as fallen, as in training (env.EnvConfig).
-FALL_TILT_DEG = 60.0
-FALL_DEPTH = 0.35  # m, trunk below its target
-LOST_ANKLE = 0.5  # m, an ankle off its target
 _LYING = 0.2  # m, height of a trunk that has come to lie
 PUSH_SECONDS = 0.1
 PUSH_LIMIT = 200.0  # N s
@@ -72,15 +69,6 @@ class View(NamedTuple):
 
 # What follows among these boxes a task step that ended here, with these wishes?
 _Question = tuple[tuple[Box, ...], Nodes, Wishes]
-
-
-def fallen(qpos: np.ndarray, qvel: np.ndarray, errors: NodeErrors) -> bool:
-    """Whether a robot at qpos (19,) and qvel (18,) lies: tilted, sunk, an ankle lost, or a state that is not finite."""
-    up = rotations.to_matrix(qpos[3:7])[2]  # the vertical in F_B
-    upright = up[2] > math.cos(math.radians(FALL_TILT_DEG))
-    risen = errors.trunk_position @ up < FALL_DEPTH
-    held = np.linalg.norm(errors.ankle_positions, axis=-1).max() < LOST_ANKLE
-    return not (upright and risen and held and np.isfinite(qpos).all() and np.isfinite(qvel).all())
 
 
 class Drive:
@@ -126,9 +114,10 @@ class Drive:
         step = self.step._replace(pendulum=self._sway * self.step.pendulum)
         command = planner.command(step, np.float64(self._tick * self.timestep))
         self.target = command.target
-        errors = nodes.difference(command.target, kinematics.measure(self.robot, self.data.qpos))
-        if self.mode is not Mode.FALLEN and fallen(self.data.qpos, self.data.qvel, errors):
-            self._fall()
+        if self.mode is not Mode.FALLEN:
+            measured = kinematics.measure(self.robot, self.data.qpos)
+            if not falls.finite(self.data.qpos, self.data.qvel) or falls.fell(command.target, measured):
+                self._fall()
         if self.mode is Mode.FALLEN:
             # nothing but its soles touches the ground, so it must not sink any further; false for nan
             if self.data.qpos[2] > _LYING and np.isfinite(self.data.qvel).all():

@@ -17,13 +17,13 @@ from mujoco import mjx
 
 from bipedtrack import (
     control,
+    falls,
     kinematics,
     nodes,
     observation,
     planner,
     rewards,
     robot,
-    rotations,
     tasks,
     terrain,
 )
@@ -31,7 +31,6 @@ from bipedtrack.rotations import Array
 
 _PUSH_SECONDS = 0.1  # s that a push lasts
 _PUSH_EVERY = 2.0  # s between the pushes of one episode, on average
-_LARGEST = 1e3  # m, rad, m/s or rad/s: a state beyond has exploded; one such number would spoil the normaliser for all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +41,6 @@ class EnvConfig:
     control: control.ControlConfig
     policy_period: float = 0.02  # s for which a feedback is held; the rest of the control law runs every 0.005 s
     stairs: bool = False  # with the boxes of a staircase (slower)
-    fall_tilt_deg: float = 60.0  # the paper's
-    fall_depth: float = 0.35  # m below its target at which the trunk counts as fallen
-    lost_ankle: float = 0.5  # m off its target at which an ankle counts as lost
 
 
 class Physics(NamedTuple):
@@ -192,11 +188,11 @@ class TrackingEnv(brax.envs.Env):
         advance = lambda carry, _: self.control_step(carry[0], carry[1], following, a_fb)  # noqa: E731
         (physics, episode), answer = jax.lax.scan(advance, (before, episode), length=self.substeps)
 
-        # false for nan, too
-        finite = (jnp.abs(physics.qpos) < _LARGEST).all() & (jnp.abs(physics.qvel) < _LARGEST).all()
+        finite = falls.finite(physics.qpos, physics.qvel)
         physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
         command = self.command(episode)
-        errors = nodes.difference(command.target, kinematics.measure(self.robot, physics.qpos))
+        measured = kinematics.measure(self.robot, physics.qpos)
+        errors = nodes.difference(command.target, measured)
         terms = rewards.terms(
             self.config.rewards.sharpness,
             errors,
@@ -207,7 +203,7 @@ class TrackingEnv(brax.envs.Env):
             jnp.where(finite, answer.qacc[-1, 6:], 0.0),
         )
         episode = episode._replace(feedback=a_fb)
-        fell = self.fell(physics, errors)
+        fell = falls.fell(command.target, measured)
         return state.replace(
             pipeline_state=physics,
             obs=self.observe(physics, episode, command),
@@ -304,11 +300,3 @@ class TrackingEnv(brax.envs.Env):
         a_ff = control.feedforward(self.robot, self.config.control, self.feedforward_nodes(episode, command))
         real = kinematics.measure(self.robot, physics.qpos)
         return observation.flatten(observation.observe(command, real, physics.qpos, physics.qvel, a_ff, episode.feedback))
-
-    def fell(self, physics: Physics, errors: nodes.NodeErrors) -> Array:
-        """() bool: tilt beyond the limit (the paper's rule), trunk far below its target, or an ankle lost."""
-        up = rotations.to_matrix(physics.qpos[3:7])[2]
-        tilted = up[2] < math.cos(math.radians(self.config.fall_tilt_deg))
-        sunk = (errors.trunk_position @ up) > self.config.fall_depth
-        lost = rewards.norm(errors.ankle_positions).max() > self.config.lost_ankle
-        return tilted | sunk | lost

@@ -104,7 +104,7 @@ def subject(name: str, options: Evaluate) -> Subject:
         the_robot, settings, period = robot.load(), control.ControlConfig(level_feet=True), 0.02
         actor = None
     else:
-        actor = policy.load(name, robot.load())
+        actor = policy.load_for_simulation(name)
         the_robot, settings, period = actor.robot, actor.settings, actor.policy_period
     asked = {name: getattr(options, name) for name in ("filter", "velocity_feedforward", "gravity_feedforward", "integral")}
     settings = dataclasses.replace(settings, **{name: value for name, value in asked.items() if value is not None})
@@ -166,7 +166,7 @@ def run(options: Evaluate) -> dict[str, Any]:
     """Evaluates everything asked for, writes it to `out` and returns what metrics.json holds."""
     who = [subject(name, options) for name in options.policies]
     options = dataclasses.replace(options, sway=_sway(who, options))
-    wanted = _tasks(options)
+    wanted = _tasks(options, who[0].robot)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "traces").mkdir(exist_ok=True)
     record: dict[str, Any] = {
@@ -203,12 +203,12 @@ def run(options: Evaluate) -> dict[str, Any]:
     return record
 
 
-def _tasks(options: Evaluate) -> tuple[str, ...]:
+def _tasks(options: Evaluate, the_robot: robot.Robot) -> tuple[str, ...]:
     """The names of the tasks. Raises ConfigError for an unknown one and footsteps.ScriptError for a bad script."""
     from bipedtrack import suite
 
     if options.script is not None:
-        footsteps.load(options.script, robot.load(), _ranges(options).usual_sway)  # refused before anything is written
+        footsteps.load(options.script, the_robot, _ranges(options).usual_sway)  # refused before anything is written
         return (options.script.stem,)
     for name in options.tasks:
         if name not in suite.TASKS:

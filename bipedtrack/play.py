@@ -80,14 +80,14 @@ def serve(options: Play) -> Iterator[Page]:
     """A page with a robot that is ready to be driven, until the context ends. Raises ValueError, RuntimeError, OSError."""
     import viser
 
-    from bipedtrack import policy, robot
+    from bipedtrack import policy
     from bipedtrack.drive import Drive
     from bipedtrack.page import Page, in_loop
     from bipedtrack.realtime import RealTime
 
     require_free(options.host, options.port)
     policies = choice(options.policy)
-    loaded = policy.load(next(iter(policies.values())), robot.load())
+    loaded = policy.load_for_simulation(next(iter(policies.values())))
     clock = RealTime(Drive(policy.Controller(loaded)))
     server = viser.ViserServer(options.host, options.port, verbose=False)
     clock.start()

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bipedtrack import checkpoint, config, control, kinematics, observation, symmetry
+from bipedtrack import robot as robots
 from bipedtrack.control import ControlConfig
 from bipedtrack.messages import Refusal
 from bipedtrack.planner import Command
@@ -123,6 +124,16 @@ def load(path: str | pathlib.Path, robot: Robot | None = None) -> Policy:
         raise PolicyError(f"{path}: {error}") from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise PolicyError(f"{path}: is no complete policy ({type(error).__name__}: {error})") from None
+    return policy
+
+
+def load_for_simulation(path: str | pathlib.Path) -> Policy:
+    """As `load`; the robot of that name in models/ must be the one that the policy was trained on. Needs MuJoCo."""
+    policy = load(path)
+    try:
+        _check_robot(policy.robot, robots.load(policy.robot.name))
+    except (PolicyError, robots.RobotError) as error:
+        raise PolicyError(f"{path}: {error}") from None
     return policy
 
 

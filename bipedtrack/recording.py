@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import control, env, kinematics, observation, planner, plans, robot
+from bipedtrack import control, env, falls, kinematics, observation, planner, plans, robot
 from bipedtrack.disturbances import UNDISTURBED, Hooks
 from bipedtrack.nodes import Nodes, stationary
 from bipedtrack.rotations import Array
-from bipedtrack.trace import Trace, upright
+from bipedtrack.trace import Trace
 
 Act = Callable[[Array], Array]  # the network's output (12,) for an observation (101,), in jax.numpy
 _CHUNK = 50  # policy steps between two looks at whether anybody is still up
@@ -59,7 +59,7 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
         def control_step(carry: Any, _: None) -> tuple[Any, _Sample]:
             (physics, episode), alive = carry
             command = the_env.command(episode)
-            alive = alive & upright(physics.qpos, physics.qvel)
+            alive = alive & _up(physics.qpos, physics.qvel)
             moved, answer = the_env.control_step(physics, episode, following, a_fb)
             sample = _Sample(
                 physics.qpos, physics.qvel, command.target, command.timer, stationary(command.rates), a_fb,
@@ -182,7 +182,7 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
                     poses = batch.boxes[i, index[i, tick]]
                     datas[i].mocap_pos[:], datas[i].mocap_quat[:] = poses[:, :3], poses[:, 3:]
                 qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
-                alive = alive & np.asarray(upright(qpos.T, qvel.T))
+                alive = alive & _up(qpos, qvel)
                 seen = (qpos, qvel) if hooks.observed is None else hooks.observed(tick, qpos, qvel)
                 told = [np.where(alive[:, None], part, 0.0).astype(np.float32) for part in seen]
                 think = np.full(robots, tick % hold == 0)
@@ -231,26 +231,36 @@ def _of_length(entries: np.ndarray, ticks: int) -> np.ndarray:
     return entries[:, :ticks] if missing <= 0 else np.concatenate([entries, entries[:, -1:].repeat(missing, axis=1)], axis=1)
 
 
-def _measure(the_robot: robot.Robot) -> Callable[[Array], Nodes]:
-    """The nodes of a robot at qpos (e, n, 19), compiled."""
-    return jax.jit(jax.vmap(jax.vmap(lambda qpos: kinematics.measure(the_robot, qpos))))
+def _up(qpos: Array, qvel: Array) -> Array:
+    """(...) bool: what can be seen of `falls` without the targets, so that a robot that lies is not simulated on."""
+    return falls.finite(qpos, qvel) & falls.upright(qpos[..., 3:7])
 
 
-def _complete(the_robot: robot.Robot, samples: _Sample, measure: Callable[[Array], Nodes]) -> Trace:
+def _measure(the_robot: robot.Robot) -> Callable[[Array, Nodes], tuple[Nodes, Array]]:
+    """The nodes of a robot at qpos (e, n, 19) and whether it is falling, with these targets, compiled."""
+
+    def at_one(qpos: Array, target: Nodes) -> tuple[Nodes, Array]:
+        measured = kinematics.measure(the_robot, qpos)
+        return measured, falls.fell(target, measured)
+
+    return jax.jit(jax.vmap(jax.vmap(at_one)))
+
+
+def _complete(the_robot: robot.Robot, samples: _Sample, measure: Callable[[Array, Nodes], tuple[Nodes, Array]]) -> Trace:
     """The trace of samples (e, n, ...): with measured nodes, torques and time."""
-    measured = measure(samples.qpos)
+    measured, fell = jax.tree.map(np.asarray, measure(samples.qpos, samples.target))
     wanted = the_robot.kp * (samples.joint_targets - samples.qpos[..., 7:]) - the_robot.kd * samples.qvel[..., 6:]
     return Trace(
         time=np.arange(samples.qpos.shape[1]) * the_robot.timestep,
         qpos=samples.qpos,
         qvel=samples.qvel,
         target=samples.target,
-        measured=jax.tree.map(np.asarray, measured),
+        measured=measured,
         timer=samples.timer,
         still=samples.still,
         feedback=samples.feedback,
         joint_targets=samples.joint_targets,
         torques=np.clip(wanted, -the_robot.torque_limit, the_robot.torque_limit),
         foot_forces=samples.foot_forces,
-        alive=samples.alive,
+        alive=samples.alive & ~np.logical_or.accumulate(fell, axis=1),
     )

@@ -82,11 +82,10 @@ class RobotError(Refusal, ValueError):
 def mjcf_path(name: str) -> pathlib.Path:
     """The path of a robot's MJCF. Raises RobotError when there is no such robot."""
     folder = paths.data_dir("models")
-    path = folder / name / f"{name}.xml"
-    if not path.is_file():
-        known = sorted(p.parent.name for p in folder.glob("*/*.xml") if p.stem == p.parent.name)
+    known = {path.stem: path for path in sorted(folder.glob("*/*.xml")) if path.stem == path.parent.name}
+    if name not in known:
         raise RobotError(f"no robot named {name!r} in models/; there are: {', '.join(known)}")
-    return path
+    return known[name]
 
 
 def load(name: str = "ranger_max") -> Robot:

@@ -12,11 +12,11 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from bipedtrack import footsteps, kinematics, metrics, nodes, planner, policy, robot, trace
+from bipedtrack import falls, footsteps, kinematics, metrics, nodes, planner, policy, robot, trace
 from bipedtrack.messages import fail
 
 
-def model_and_data(script: footsteps.Script, name: str = "ranger_max") -> tuple[Any, Any]:
+def model_and_data(script: footsteps.Script, name: str) -> tuple[Any, Any]:
     """MuJoCo's model and data of a robot at the script's start, with the script's boxes in place."""
     import mujoco
 
@@ -34,9 +34,9 @@ def model_and_data(script: footsteps.Script, name: str = "ranger_max") -> tuple[
 def record(controller: policy.Controller, script: footsteps.Script, seconds: float | None = None) -> trace.Trace:
     """Walks the script, holds its end until `seconds` are over if they are given, and records every control step.
 
-    The trace has no axis of robots. It ends with a fall: a trunk tilted by more than 60 deg or a state that is not finite.
+    The trace has no axis of robots. It ends with a fall (`falls`).
     """
-    model, data = model_and_data(script)
+    model, data = model_and_data(script, controller.policy.robot.name)
     controller.reset(data.qpos)
     rows: list[list[Any]] = []
     for command in footsteps.commands(script, model.opt.timestep, seconds):
@@ -55,7 +55,7 @@ def control_step(controller: policy.Controller, model: Any, data: Any, command: 
 
     state = [data.time, data.qpos.copy(), data.qvel.copy()]
     measured = kinematics.measure(controller.policy.robot, state[1])
-    alive = bool(trace.upright(data.qpos, data.qvel))
+    alive = bool(falls.finite(data.qpos, data.qvel) & ~falls.fell(command.target, measured))
     if np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all():
         data.ctrl[:] = controller.step(data.qpos, data.qvel, command)
     mujoco.mj_step(model, data)
@@ -104,9 +104,9 @@ def main() -> None:
     try:
         if options.seconds is not None and not 0 < options.seconds < 1e5:
             raise ValueError(f"--seconds {options.seconds}: must be positive and less than 100000")
-        the_robot = robot.load()
-        controller = policy.Controller(policy.load(options.policy, the_robot), options.feedback)
-        script = footsteps.load(options.script, the_robot, controller.policy.sway)
+        driven = policy.load_for_simulation(options.policy)
+        script = footsteps.load(options.script, driven.robot, driven.sway)
+        controller = policy.Controller(driven, options.feedback)
         recorded = record(controller, script, options.seconds)
         print(summary(recorded))
     except (ValueError, RuntimeError, OSError) as error:

@@ -33,7 +33,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from bipedtrack import follower, footsteps, kinematics, packets, paths, policy, robot, simulate, trace
+from bipedtrack import follower, footsteps, kinematics, packets, paths, policy, simulate, trace
 from bipedtrack.messages import fail
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 
@@ -102,7 +102,7 @@ class Teleoperation:
     ):
         """script: whose boxes stand on the ground; hold: s of silence after which the robot goes back to standing."""
         self.controller, self.robot = controller, controller.policy.robot
-        self.model, self.data = simulate.model_and_data(script)
+        self.model, self.data = simulate.model_and_data(script, controller.policy.robot.name)
         start = footsteps.initial_nodes(self.robot)
         self.address = source.getsockname()
         self.receiver = Receiver(source, follower.Follower(self.robot, start, script.boxes, hold))
@@ -235,15 +235,14 @@ def main() -> None:
             raise ValueError("--record needs --seconds")
         if options.record is not None and not options.record.parent.is_dir():
             raise ValueError(f"--record {options.record}: there is no such folder")
-        the_robot = robot.load()
-        script = footsteps.load(options.ground, the_robot) if options.ground else LEVEL_GROUND
         file = options.policy or paths.data_dir("models") / "policies" / "best.npz"
-        controller = policy.Controller.load(file, the_robot)
+        driven = policy.load_for_simulation(file)
+        script = footsteps.load(options.ground, driven.robot) if options.ground else LEVEL_GROUND
         rows: list[list[Any]] | None = [] if options.record else None
         with listen(options.host, options.port) as source:
             print("listening on {} port {}".format(*source.getsockname()), flush=True)
             with contextlib.suppress(KeyboardInterrupt):
-                Teleoperation(controller, source, script, options.hold).run(options.seconds, rows)
+                Teleoperation(policy.Controller(driven), source, script, options.hold).run(options.seconds, rows)
         if options.record and rows:
             trace.save(simulate.to_trace(rows), options.record)
             print(options.record)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bipedtrack.nodes import Nodes
-from bipedtrack.rotations import Array
 
 
 class Trace(NamedTuple):
@@ -43,12 +42,6 @@ class Trace(NamedTuple):
     def until(self, count: int) -> Trace:
         """The first entries of the trace of one robot."""
         return Trace(*(_pick(part, slice(count)) for part in self))
-
-
-def upright(qpos: Array, qvel: Array) -> Array:
-    """Whether a robot's state is finite and its trunk tilted by less than 60 deg; leading axes of 19 and 18."""
-    finite = (abs(qpos) < 1e6).all(axis=0) & (abs(qvel) < 1e6).all(axis=0)
-    return finite & (1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2) > 0.5)
 
 
 def _pick(part: Any, index: int | slice | np.ndarray) -> Any:

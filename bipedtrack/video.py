@@ -226,7 +226,7 @@ def main() -> None:
         _check(options)
         require_writable(options.out, options.size)
         choose_backend()
-        driven = policy.load(options.policy, robot.load())
+        driven = policy.load_for_simulation(options.policy)
         recorded, boxes, sizes = _record_script(options, driven) if options.script else _record_task(options, driven)
         print(simulate.summary(recorded))
         model = robot.build_model(driven.robot.name, sizes)

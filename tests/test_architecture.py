@@ -18,7 +18,7 @@ LADDER = """
     compilation distributed
     config checkpoint run_directory
     rotations robot
-    nodes kinematics statics trace packets
+    nodes kinematics statics falls trace packets
     planner terrain sampling feasibility rows
     footsteps footholds tasks scripts steering plans disturbances
     control observation symmetry rewards feedback_error balance swings metrics verdicts charts

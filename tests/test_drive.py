@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bipedtrack import drive as drives
-from bipedtrack import env, footsteps, nodes, paths, policy, rotations, scripts
+from bipedtrack import footsteps, nodes, paths, policy, rotations, scripts
 from bipedtrack import robot as robots
 from bipedtrack.drive import Drive, Mode
 from bipedtrack.footholds import Foothold
@@ -165,12 +165,6 @@ def test_after_a_fall_it_stands_up_at_the_last_foothold(drive: Drive) -> None:
     assert drive.mode is Mode.STEER
     assert at[2] > 0.7
     footsteps.parse(drive.as_script(), drive.robot, "after a fall")
-
-
-def test_the_rule_of_falls_is_that_of_training() -> None:
-    defaults = env.EnvConfig.__dataclass_fields__
-    mine = (drives.FALL_TILT_DEG, drives.FALL_DEPTH, drives.LOST_ANKLE)
-    assert mine == tuple(defaults[name].default for name in ("fall_tilt_deg", "fall_depth", "lost_ankle"))
 
 
 def test_without_feedback_it_falls_and_with_it_again_it_does_not(drive: Drive) -> None:

@@ -325,6 +325,24 @@ def test_a_policy_of_a_robot_that_differs_anywhere_is_refused(content, scratch, 
         Controller.load(scratch, robot=other)
 
 
+@pytest.mark.parametrize("name", ["stranger", "../models/ranger_max", "", 7])
+def test_a_policy_of_a_robot_that_is_not_there_is_not_simulated(original, tmp_path, name):
+    path = tmp_path / "policy.npz"
+    policy.save(dataclasses.replace(original, robot=dataclasses.replace(ROBOT, name=name)), path)
+    with pytest.raises(PolicyError) as error:
+        policy.load_for_simulation(path)
+    assert str(error.value) == f"{path}: no robot named {name!r} in models/; there are: ranger_max"
+
+
+def test_a_policy_of_a_robot_that_has_changed_is_not_simulated(original, tmp_path):
+    path = tmp_path / "policy.npz"
+    policy.save(original, path)
+    assert policy.load_for_simulation(path).robot.name == "ranger_max"
+    policy.save(dataclasses.replace(original, robot=dataclasses.replace(ROBOT, kp=2 * ROBOT.kp)), path)
+    with pytest.raises(PolicyError, match="another kp than 'ranger_max' has"):
+        policy.load_for_simulation(path)
+
+
 def test_a_robot_is_the_same_under_another_name(content, scratch):
     scratch.write_bytes(content)
     policy.load(scratch, robot=dataclasses.replace(ROBOT, name="copy"))

@@ -284,6 +284,14 @@ def test_robots_stand_on_the_boxes_of_the_plan(recorded: Trace, plan: plans.Plan
 # Falls
 
 
+def fallen_by_hand(trace: Trace) -> np.ndarray:
+    """Where a robot is tilted by 60 deg, 0.35 m below its target or has an ankle 0.5 m off, (e, n)."""
+    tilted = 1 - 2 * (trace.qpos[..., 4] ** 2 + trace.qpos[..., 5] ** 2) <= 0.5
+    sunk = trace.target.trunk_position[..., 2] - trace.qpos[..., 2] >= 0.35
+    off = trace.target.ankle_positions - trace.measured.ankle_positions
+    return tilted | sunk | (np.sqrt((off**2).sum(axis=-1)) >= 0.5).any(axis=-1)
+
+
 def test_when_all_have_fallen_the_trace_keeps_its_length(
     recorders: Recorders, recorded: Trace, plan: plans.Plan, robot: robots.Robot, request: pytest.FixtureRequest
 ) -> None:
@@ -310,11 +318,25 @@ def test_when_all_have_fallen_the_trace_keeps_its_length(
     assert fallen.alive[:, 0].all() and not fallen.alive[:, stopped:].any() and 2 < stopped <= 200
     assert (np.diff(fallen.alive.astype(int), axis=1) <= 0).all()
     assert (fallen.qpos[:, stopped:] == fallen.qpos[:, stopped - 1 : stopped]).all()  # nothing is simulated any more
-    up = 1 - 2 * (fallen.qpos[..., 4] ** 2 + fallen.qpos[..., 5] ** 2)
-    last = fallen.alive.sum(axis=1) - 1
-    assert (up[fallen.alive] > 0.5).all() and (up[np.arange(len(KINDS)), last + 1] <= 0.5).all()
+    bad = fallen_by_hand(fallen)
+    first_bad = fallen.alive.sum(axis=1)
+    assert not bad[fallen.alive].any() and bad[np.arange(len(KINDS)), first_bad].all()
     summary = metrics.summarise(fallen, robot, 400.0)
     assert summary["survival"]["falls"] == len(KINDS) and summary["seconds"] == pytest.approx(SECONDS)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_a_robot_whose_target_leaves_it_has_fallen_though_it_is_upright(
+    recorders: Recorders, plan: plans.Plan, engine: str
+) -> None:
+    moved = jax.tree.map(np.copy, plan)
+    moved.steps.end.trunk_position[:, 0, 2] += 1.0  # higher than its legs are long
+    found = recorders.mjx(moved, SECONDS) if engine == "mjx" else recorders.mujoco(moved, SIZES, SECONDS)
+    for i in STAND:
+        standing, bad = found.alive[i].sum(), fallen_by_hand(found.episode(i))
+        assert 2 < standing < TICKS and not found.alive[i, standing:].any()
+        assert not bad[:standing].any() and bad[standing]
+        assert 1 - 2 * (found.qpos[i, standing, 4] ** 2 + found.qpos[i, standing, 5] ** 2) > 0.8
 
 
 # Without feedforward
