@@ -11,12 +11,14 @@ import math
 import pathlib
 from typing import Any, Literal
 
-from bipedtrack import checkpoint, config, footsteps, paths, scripts
+from bipedtrack import checkpoint, config, footsteps, paths, scripts, terrain
 from bipedtrack.control import ControlConfig
 from bipedtrack.rewards import RewardConfig
 from bipedtrack.robot import Robot
 from bipedtrack.run_directory import RunDirectory
 from bipedtrack.sampling import Ranges, Shares
+
+_UPDATES_PER_EPOCH = 8  # of brax, between two looks at whether somebody wants the training to stop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Lesson:
     """A part of a stage with one difficulty."""
 
     name: str
-    steps: int  # policy steps, over all environments
+    steps: int  # policy steps, over all environments; each part is rounded up (Call.steps)
     difficulty: float  # 0 the mildest, 1 the full ranges
     parts: int = 1  # PPO calls that share the steps; a killed run repeats at most one
     push_share: float = 0.0  # share of the episodes with pushes
@@ -162,6 +164,13 @@ class Curriculum:
             raise ValueError("evaluation_episodes must not be negative")
         if not 0 < self.policy_period <= self.episode_seconds:
             raise ValueError("policy_period must be positive and no longer than episode_seconds")
+        for stage in self.stages:
+            most = terrain.TREADS_DOWN * ranges_of(self, stage).period[0]
+            if stage.shares.stairs > 0 and self.episode_seconds > most:
+                raise ValueError(
+                    f"episode_seconds ({self.episode_seconds:g}) must be at most {most:g} in stage {stage.name!r}: "
+                    f"a staircase down has {terrain.TREADS_DOWN} treads"
+                )
 
     @property
     def episode_length(self) -> int:
@@ -183,7 +192,8 @@ class Call:
     index: int  # among all calls
     stage: Stage
     lesson: Lesson
-    steps: int  # policy steps
+    steps: int  # policy steps: its share of the lesson's, rounded up to whole epochs of whole updates as brax does it
+    epochs: int  # after each of which brax reports
     learning_rate: float
     entropy_cost: float
     clipping_epsilon: float
@@ -206,8 +216,11 @@ def calls(curriculum: Curriculum) -> tuple[Call, ...]:
             )
             for part in range(lesson.parts):
                 steps = lesson.steps // lesson.parts + (part < lesson.steps % lesson.parts)
+                updates = math.ceil(steps / curriculum.ppo.steps_per_update)
+                epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
+                steps = epochs * math.ceil(updates / epochs) * curriculum.ppo.steps_per_update
                 noise = lesson.noise if part == 0 else None
-                found.append(Call(len(found), stage, lesson, steps, rate, entropy, epsilon, noise))
+                found.append(Call(len(found), stage, lesson, steps, epochs, rate, entropy, epsilon, noise))
             done += lesson.steps
     return tuple(found)
 
@@ -244,7 +257,7 @@ def scripts_of(curriculum: Curriculum, stage: Stage, robot: Robot) -> list[foots
 def load(name_or_path: str) -> Curriculum:
     """A curriculum from a TOML file, or by its name from `curricula/`. Raises config.ConfigError in one line."""
     path = pathlib.Path(name_or_path)
-    if not path.suffix and not path.exists():
+    if not path.suffix and not path.is_file():
         folder = paths.data_dir("curricula")
         path = folder / f"{name_or_path}.toml"
         if not path.is_file():

@@ -117,7 +117,10 @@ def to_arrays(params: Params) -> dict[str, np.ndarray]:
 
 
 def from_arrays(config: curriculum.Curriculum, arrays: dict[str, np.ndarray]) -> Params:
-    """Brax's parameters from a checkpoint's arrays. Raises CheckpointError where they do not fit the curriculum."""
+    """Brax's parameters from a checkpoint's arrays, with the curriculum's own `normalizer_floor` from now on.
+
+    Raises CheckpointError where they do not fit the curriculum.
+    """
     wanted, structure = _named_leaves(template(config))
     if set(wanted) != set(arrays):
         odd = sorted(set(wanted) ^ set(arrays))[0]
@@ -128,7 +131,9 @@ def from_arrays(config: curriculum.Curriculum, arrays: dict[str, np.ndarray]) ->
                 f"checkpoint does not fit the curriculum's networks: {name} is {arrays[name].dtype}"
                 f"{list(arrays[name].shape)}, wanted {leaf.dtype}{list(leaf.shape)}"
             )
-    return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name in wanted])
+    normalizer, actor, critic = jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name in wanted])
+    floor = jnp.full_like(normalizer.std_eps, config.network.normalizer_floor)
+    return normalizer.replace(std_eps=floor), actor, critic
 
 
 def to_policy(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import logging
 import os
 import pathlib
@@ -121,7 +122,7 @@ def use_devices(device: str, count: int, ppo: curriculum.PpoConfig, process: Pro
         reason = (str(error) or "no such back end").splitlines()[0]
         raise DeviceError(
             f"--device {device}: JAX finds no such device ({reason}); use --device cpu, or "
-            "`pip install bipedtrack[cuda]` on a machine with an NVIDIA GPU"
+            "`pip install '.[cuda]'` on a machine with an NVIDIA GPU"
         ) from None
     count = count or len(found)
     if count > len(found):
@@ -138,7 +139,8 @@ def use_devices(device: str, count: int, ppo: curriculum.PpoConfig, process: Pro
 
 def _cores_with_work(ppo: curriculum.PpoConfig, processes: int) -> int:
     """The greatest number of cores that share the robots evenly with at least _ROBOTS_A_CORE each; at least 1."""
-    most = min(len(os.sched_getaffinity(0)), ppo.num_envs // processes // _ROBOTS_A_CORE)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
+    most = min(cores, ppo.num_envs // processes // _ROBOTS_A_CORE)
     return next((count for count in range(most, 1, -1) if ppo.shares_out(count * processes)), 1)
 
 
@@ -225,11 +227,13 @@ def _start(path: pathlib.Path, plan: Curriculum) -> checkpoint.Checkpoint:
         networks.from_arrays(plan, found.arrays)
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(f"--start {path}: {error}") from None
-    symmetric, wanted = found.provenance.get("symmetric"), plan.network.symmetric  # older ones do not say
-    if symmetric not in (None, wanted):
-        raise checkpoint.CheckpointError(
-            f"--start {path}: was trained with network.symmetric = {str(symmetric).lower()}; the curriculum wants the other"
-        )
+    network = plan.network
+    for name, wanted in {"robot": plan.robot, "activation": network.activation, "symmetric": network.symmetric}.items():
+        trained = found.provenance.get(name, wanted)  # older checkpoints do not say
+        if trained != wanted:
+            raise checkpoint.CheckpointError(
+                f"--start {path}: was trained with {name} = {json.dumps(trained)}; the curriculum has {json.dumps(wanted)}"
+            )
     return found
 
 

@@ -1,7 +1,8 @@
 """Stages and lessons as brax PPO calls, one after another; only `ppo_arguments` knows the names of what brax is told.
 
-A call is a pure function of (parameters, call, run's seed). A run that was killed repeats its unfinished call and ends in
-bitwise the same parameters on the same machine; what a call costs to repeat is set by the curriculum (`parts`).
+A call is a pure function of (parameters, call, run's seed), the robot's files and the footstep scripts, which a run names
+and does not keep. A run that was killed repeats its unfinished call and ends in bitwise the same parameters on the same
+machine; what a call costs to repeat is set by the curriculum (`parts`).
 """
 
 from __future__ import annotations
@@ -41,7 +42,6 @@ from bipedtrack.progress import Aside, Progress
 from bipedtrack.run_directory import RunDirectory
 
 _LOOK_BACK = 1.0  # s before a fall from which, or from up to twice as much before, it is tried again
-_UPDATES_PER_EPOCH = 8  # updates between two looks at whether somebody wants the training to stop
 
 
 class Stopped(Exception):
@@ -118,10 +118,7 @@ def _run_call(
     progress: Progress | Aside,
     wants_to_stop: Callable[[], bool],
 ) -> Params:
-    """One `ppo.train` from the given parameters. Steps are rounded up to whole epochs of whole updates."""
-    ppo_config = config.ppo
-    updates = math.ceil(call.steps / ppo_config.steps_per_update)
-    epochs = math.ceil(updates / _UPDATES_PER_EPOCH)
+    """One `ppo.train` from the given parameters."""
     the_env = make_env(config, call.stage, call.lesson)
     if params is not None and call.noise is not None:
         params = networks.with_noise(params, call.noise)
@@ -134,12 +131,12 @@ def _run_call(
             raise Stopped
 
     look_back = round(_LOOK_BACK / config.policy_period)
-    progress.compiling(call, f"the environment and the learner for {ppo_config.num_envs} robots")
+    progress.compiling(call, f"the environment and the learner for {config.ppo.num_envs} robots")
     with adapted_brax(_term(the_env.robot, call.stage.feedback_error)):
         _, params, _ = ppo.train(
             environment=autoreset.AutoReset(the_env, config.episode_length, call.stage.retries, look_back),
-            num_timesteps=updates * ppo_config.steps_per_update,
-            num_evals=epochs + 1,
+            num_timesteps=call.steps,
+            num_evals=call.epochs + 1,
             seed=call_seed(seed, call.index),
             max_devices_per_host=devices,
             restore_params=params,
@@ -253,6 +250,8 @@ def provenance(
         "curriculum": config.name,
         "seed": seed,
         "steps": sum(call.steps for call in curriculum.calls(config)[:finished_calls]),
+        "robot": config.robot,
+        "activation": config.network.activation,
         "symmetric": config.network.symmetric,
         "bipedtrack": __version__,
         "versions": {row.name: row.found for row in versions.check()},

@@ -82,7 +82,7 @@ def test_paper_is_table_iii() -> None:
 
 def test_paper_follows_the_falling_lines_of_its_stages() -> None:
     made = calls(load("paper"))
-    assert sum(call.steps for call in made) == 300_000_000
+    assert all(0 <= call.steps - call.lesson.steps / call.lesson.parts < 0.05 * call.steps for call in made)
     # stage 1: 150 M steps in lessons of 10 M, so the first call's middle is 5 M and its last one's 145 M
     first, last = made[0], [call for call in made if call.stage.name == "level ground"][-1]
     assert first.learning_rate == pytest.approx(3e-4 * 145 / 150) and last.learning_rate == pytest.approx(3e-4 * 5 / 150)
@@ -99,11 +99,13 @@ def test_paper_follows_the_falling_lines_of_its_stages() -> None:
 
 
 def test_calls_share_the_steps_of_their_lessons(tmp_path: pathlib.Path) -> None:
-    made = calls(loaded(tmp_path, MINIMAL))
+    # updates of 2 steps: 26 and 25 steps are 13 updates, in two epochs of 7; 49 and 50 are 25, in four of 7
+    made = calls(loaded(tmp_path, MINIMAL + "[ppo]\nnum_envs = 2\nunroll_length = 1\nnum_minibatches = 1\n"))
     assert [call.index for call in made] == list(range(7))
     assert [call.lesson.name for call in made] == ["short"] * 4 + ["long"] * 2 + ["all"]
     assert [call.stage.name for call in made] == ["ground"] * 6 + ["hold"]
-    assert [call.steps for call in made] == [26, 26, 26, 25, 49, 48, 50]
+    assert [call.steps for call in made] == [28, 28, 28, 28, 56, 48, 56]
+    assert [call.epochs for call in made] == [2, 2, 2, 2, 4, 3, 4]
 
 
 def test_a_lesson_may_begin_with_another_noise_in_its_first_part_alone(tmp_path: pathlib.Path) -> None:
@@ -124,7 +126,7 @@ def test_a_lesson_takes_the_value_of_its_middle_on_the_falling_line_of_its_stage
 
 
 def test_a_stage_sets_only_what_differs_from_the_curriculum(tmp_path: pathlib.Path) -> None:
-    common = "[ranges]\nperiod = [0.3, 0.5, 0.9]\nlift = [0.05, 0.06, 0.07]\n[rewards.sharpness]\nankle_yaw = 7\n"
+    common = "[ranges]\nperiod = [0.35, 0.5, 0.9]\nlift = [0.05, 0.06, 0.07]\n[rewards.sharpness]\nankle_yaw = 7\n"
     weights = "[rewards.weights]\n" + "".join(f"{term} = 0.25\n" for term in Terms._fields)
     common += "[control]\nfilter = 0.3\n"
     own = "[stages.ranges]\nlift = [0.01, 0.02, 0.03]\n[stages.rewards.weights]\nlive = 2\n[stages.control]\nintegral = 1\n"
@@ -133,7 +135,7 @@ def test_a_stage_sets_only_what_differs_from_the_curriculum(tmp_path: pathlib.Pa
     assert first.ranges is None and first.rewards is None and first.control is None
     assert control_of(plan, first) == ControlConfig(filter=0.3)
     assert control_of(plan, second) == ControlConfig(filter=0.3, integral=1.0)
-    assert second.ranges == Ranges(period=(0.3, 0.5, 0.9), lift=(0.01, 0.02, 0.03))
+    assert second.ranges == Ranges(period=(0.35, 0.5, 0.9), lift=(0.01, 0.02, 0.03))
     assert second.rewards == RewardConfig(Terms(*([0.25] * len(Terms._fields)))._replace(live=2.0), Sharpness(ankle_yaw=7.0))
 
 
@@ -174,6 +176,10 @@ ADDED = [  # what is put in front, and the line it gives
     ("[control]\nfilter = 0\n", "control: filter must lie in (0, 1], not 0"),
     ("policy_period = -0.02\n", "policy_period must be positive and no longer than episode_seconds"),
     ("policy_period = 0.02\nepisode_seconds = 0.01\n", "policy_period must be positive and no longer than episode_seconds"),
+    (
+        "episode_seconds = 12.5\n",
+        "episode_seconds (12.5) must be at most 12 in stage 'hold': a staircase down has 30 treads",
+    ),
     ("evaluation_episodes = -1\n", "evaluation_episodes must not be negative"),
     ("policy_period = nan\n", "policy_period: nan (float) does not fit; wanted a finite number"),
     ("stage = 1\n", "stage: unknown key; did you mean 'stages'?"),

@@ -65,6 +65,16 @@ def test_parameters_come_back_from_their_arrays_as_they_were() -> None:
     assert (arrays["1/params/MLP_0/hidden_1/kernel"] == kernel).all() and kernel.shape == (24, 8)
 
 
+def test_the_floor_of_the_normaliser_is_the_curriculums_also_for_another_ones_checkpoint() -> None:
+    params, _ = parameters(plan(normalizer_floor=0.5))
+    normalizer, *others = networks.from_arrays(plan(normalizer_floor=0.01), networks.to_arrays(params))
+    assert same(others, list(params[1:])) and (normalizer.std == params[0].std).all()
+    seen = np.zeros((40, 101), np.float32)  # of which nothing varies
+    variance = np.asarray(normalizer.summed_variance, float) + np.asarray(normalizer.mean, float) ** 2 * 50 * 40 / 90
+    found = running_statistics.update(normalizer, jnp.asarray(seen)).std
+    np.testing.assert_allclose(found, np.sqrt(variance / 90 + 0.01), rtol=1e-4)
+
+
 def test_arrays_that_do_not_fit_the_networks_are_refused_in_one_line_that_names_them() -> None:
     config = plan()
     arrays = networks.to_arrays(parameters(config)[0])
