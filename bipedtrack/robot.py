@@ -1,8 +1,10 @@
 """What never changes about a robot: link lengths, joint order, limits, gains, and its MuJoCo model.
 
 A robot is a folder `models/<name>/` with `<name>.xml` (MJCF; its position actuators are the PD controllers) and
-`<name>.toml` (what an MJCF does not say). Nothing is written twice: lengths, ranges and gains come from the compiled
-model, so this module needs MuJoCo, but only inside the functions that load.
+`<name>.toml` (what an MJCF does not say). The MJCF names its joints `<leg>_<joint>`, by LEGS and JOINTS, the contact
+spheres of the feet `<leg>_sole_*`, and the bodies `trunk`, which is free and whose frame is F_B, and `<leg>_foot`. Nothing
+is written twice: lengths, ranges and gains come from the compiled model, so this module needs MuJoCo, but only inside the
+functions that load.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from bipedtrack import config, paths
 from bipedtrack.messages import Refusal
 
 LEGS = ("left", "right")
+JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")  # of a leg, from hip to foot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,11 +63,8 @@ class Robot:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """The robot's TOML file: names that the MJCF uses and what it does not say."""
+    """The robot's TOML file: what the MJCF does not say."""
 
-    trunk: str
-    legs: tuple[str, str]
-    joints: tuple[str, str, str, str, str, str]
     feedback_ratio: float
     leg_length: tuple[float, float]
 
@@ -90,20 +90,34 @@ def mjcf_path(name: str) -> pathlib.Path:
 
 def load(name: str = "ranger_max") -> Robot:
     """The constants of a robot, in float64. Raises RobotError or config.ConfigError in one line."""
-    import mujoco
-
     path = mjcf_path(name)
     description = config.load(Description, path.with_suffix(".toml"))
-    return from_model(name, mujoco.MjModel.from_xml_path(str(path)), description)
+    return from_model(name, _spec(path).compile(), description)
+
+
+def _spec(path: pathlib.Path) -> Any:
+    """MuJoCo's specification of an MJCF. Raises RobotError where it is no MJCF that compiles."""
+    import mujoco
+
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compile()
+    except ValueError as error:
+        raise RobotError(f"{path}: is no MJCF that MuJoCo compiles: {' '.join(str(error).split())}") from None
+    return spec
 
 
 def from_model(name: str, model: Any, description: Description) -> Robot:
     """The constants read from a compiled MuJoCo model. Raises RobotError where names or the order do not fit."""
-    joint_names = tuple(f"{leg}_{joint}" for leg in description.legs for joint in description.joints)
+    joint_names = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
     actuated = tuple(model.joint(int(i)).name for i in model.actuator_trnid[:, 0])
     ordered = tuple(model.joint(i).name for i in range(1, model.njnt))
     if actuated != joint_names or ordered != joint_names:
         raise RobotError(f"{name}: joints and actuators must be {', '.join(joint_names)}, in this order")
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    for body in ("trunk", *(f"{leg}_foot" for leg in LEGS)):
+        if body not in bodies:
+            raise RobotError(f"{name}: no body is named {body}")
     joints = [model.joint(n) for n in joint_names]
     low, high = np.array([j.range for j in joints]).T
 
@@ -111,17 +125,20 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         """Thigh, shank and foot, the bodies that carry those joints."""
         return [model.body(int(model.joint(f"{leg}_{joint}").bodyid[0])) for joint in ("hip_yaw", "knee", "ankle_pitch")]
 
-    left, right = map(links, description.legs)
-    soles = [g for g in map(model.geom, range(model.ngeom)) if g.name.startswith(f"{description.legs[0]}_sole")]
+    left, right = map(links, LEGS)
+    thigh, shank = float(-left[1].pos[2]), float(-left[2].pos[2])
+    if description.leg_length[1] > thigh + shank:
+        raise RobotError(f"{name}: leg_length {list(description.leg_length)}: a leg is {thigh + shank:g} m long at most")
+    soles = [g for g in map(model.geom, range(model.ngeom)) if g.name.startswith(f"{LEGS[0]}_sole")]
     if not soles:
-        raise RobotError(f"{name}: no geom is named {description.legs[0]}_sole_*, which touch the ground")
+        raise RobotError(f"{name}: no geom is named {LEGS[0]}_sole_*, which touch the ground")
     corners = np.array([g.pos for g in soles])
     return Robot(
         name=name,
         joint_names=joint_names,
         hips=np.array([left[0].pos, right[0].pos]),
-        thigh=float(-left[1].pos[2]),
-        shank=float(-left[2].pos[2]),
+        thigh=thigh,
+        shank=shank,
         ankle_height=float(soles[0].size[0] - corners[0, 2]),
         sole=2 * np.abs(corners[:, :2]).max(axis=0),
         leg_length=np.array(description.leg_length),
@@ -131,7 +148,7 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         kp=model.actuator_gainprm[:, 0].copy(),
         kd=-model.actuator_biasprm[:, 2],
         torque_limit=model.actuator_forcerange[:, 1].copy(),
-        masses=np.array([model.body(description.trunk).mass[0], *(link.mass[0] for link in left)]),
+        masses=np.array([model.body("trunk").mass[0], *(link.mass[0] for link in left)]),
         centres=np.array([-link.ipos[2] for link in left]),
         timestep=float(model.opt.timestep),
     )
@@ -148,7 +165,7 @@ def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: boo
     """
     import mujoco
 
-    spec = mujoco.MjSpec.from_file(str(mjcf_path(name)))
+    spec = _spec(mjcf_path(name))
     for i, size in enumerate(boxes):
         body = spec.worldbody.add_body(name=f"box_{i}", mocap=True, pos=[0, 0, -10.0 - i])
         body.add_geom(

@@ -319,6 +319,15 @@ def a_joint_has_another_name(spec: mujoco.MjSpec) -> None:
     spec.joint("left_knee").name = spec.actuator("left_knee").target = "left_tibia"
 
 
+def a_foot_has_another_name(spec: mujoco.MjSpec) -> None:
+    spec.body("right_foot").name = "right_shoe"
+
+
+def a_shank_is_short(spec: mujoco.MjSpec) -> None:
+    for leg in LEGS:
+        spec.body(f"{leg}_foot").pos = [0, 0, -0.3]
+
+
 def the_soles_are_missing(spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
         geom.name = geom.name.replace("sole", "base")
@@ -330,6 +339,8 @@ def the_soles_are_missing(spec: mujoco.MjSpec) -> None:
         (first_two_actuators_change_places, "joints and actuators must be left_hip_yaw, left_hip_roll,.* in this order"),
         (the_legs_change_places, "joints and actuators must be left_hip_yaw, .* in this order"),
         (a_joint_has_another_name, "joints and actuators must be .*left_knee"),
+        (a_foot_has_another_name, "no body is named right_foot"),
+        (a_shank_is_short, r"leg_length \[0.35, 0.74\]: a leg is 0.7 m long at most"),
         (the_soles_are_missing, "no geom is named left_sole"),
     ],
 )
@@ -394,3 +405,8 @@ def test_another_robot_is_simulated_and_evaluated_as_itself(tmp_path: Path) -> N
     run("bipedtrack.evaluate", "heavy.npz", "--script", "walk.csv", "--engine", "converged")
     found = json.loads((tmp_path / "evaluation/metrics.json").read_text())["tasks"]["walk"]["policies"]["heavy.npz"]
     assert found["converged"]["summary"]["survival"]["falls"] == 0
+
+    (tmp_path / "models/heavy/heavy.xml").write_text("<mujoco>\n<worldbody>\n<body/>\n</mujoco>")
+    with pytest.raises(AssertionError, match="heavy.npz: .*heavy.xml: is no MJCF that MuJoCo compiles: XML") as refusal:
+        run("bipedtrack.simulate", "heavy.npz", "walk.csv")
+    assert "Traceback" not in str(refusal.value)
