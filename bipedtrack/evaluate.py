@@ -14,6 +14,7 @@ from bipedtrack import (
     checkpoint,
     config,
     control,
+    disturbances,
     footsteps,
     metrics,
     policy,
@@ -21,11 +22,12 @@ from bipedtrack import (
     sampling,
     scripts,
     statics,
+    terrain,
     trace,
     versions,
 )
 from bipedtrack.disturbances import LADDERS, UNDISTURBED, Hooks
-from bipedtrack.messages import fail, quiet_imports
+from bipedtrack.messages import Refusal, fail, quiet_imports
 from bipedtrack.swings import Boxes
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
 SEED = 2024
 ENGINES = ("mjx", "mujoco", "converged")
+_AFTER_PUSH = 3.0  # s in which a robot that was pushed falls, if it does
 _TRACES = 2  # episodes of each task whose traces are written
 
 
@@ -41,13 +44,14 @@ class Evaluate:
     """Evaluates policies on the tasks of the suite or on a footstep script: table, metrics.json, report.html, traces."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Policy files or run directories; `ik`: feedforward alone; `zero`: joint targets stay where they were at first."""
+    """Policy files or run directories; `ik`: inverse kinematics, filter and PD of ranger_max alone (a policy without its
+    network is `--feedback-ratio 0`); `zero`: joint targets stay where they were at first."""
     tasks: tuple[str, ...] = ()
     """Tasks of the suite; all when not given."""
     script: pathlib.Path | None = None
     """A footstep script instead of the tasks."""
     episodes: int = 256
-    """Of each task."""
+    """Of each random task; a script is the same every time and run once."""
     seconds: float = 10.0
     """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
     engine: Literal["mjx", "mujoco", "converged", "both"] = "both"
@@ -60,7 +64,8 @@ class Evaluate:
     out: pathlib.Path = pathlib.Path("evaluation")
     """Where metrics.json, report.html and traces/ go."""
     robustness: bool = False
-    """Also pushes, payload, friction, motors, delay, noise and masses, in C."""
+    """Also walking forward with pushes, payload, friction, motors, delay, noise and masses: at most 64 episodes a level, in
+    MuJoCo C with the MJCF's solver."""
     feedback_ratio: float | None = None
     """Another k_b for every joint."""
     filter: float | None = None
@@ -107,7 +112,10 @@ def subject(name: str, options: Evaluate) -> Subject:
         actor = policy.load_for_simulation(name)
         the_robot, settings, period = actor.robot, actor.settings, actor.policy_period
     asked = {name: getattr(options, name) for name in ("filter", "velocity_feedforward", "gravity_feedforward", "integral")}
-    settings = dataclasses.replace(settings, **{name: value for name, value in asked.items() if value is not None})
+    try:
+        settings = dataclasses.replace(settings, **{name: value for name, value in asked.items() if value is not None})
+    except ValueError as error:
+        raise config.ConfigError(str(error)) from None
     if options.feedback_ratio is not None:
         ratio = np.full_like(the_robot.feedback_ratio, options.feedback_ratio)
         the_robot = dataclasses.replace(the_robot, feedback_ratio=ratio)
@@ -150,7 +158,7 @@ class Engines:
 
 
 def boxes_of(batch: suite.Batch) -> Boxes | None:
-    """The boxes of a batch for the clearance; None where there are none."""
+    """The boxes of a batch for the clearance; None where nothing stands on the ground."""
     if not batch.sizes:
         return None
     # a window of three treads holds every tread once if looked at every third task step
@@ -158,6 +166,8 @@ def boxes_of(batch: suite.Batch) -> Boxes | None:
     poses = np.asarray(batch.plan.boxes)[:, 1::3] if stairs else np.asarray(batch.plan.boxes)[:, :1]
     count = poses.shape[1]
     poses = poses.reshape(len(poses), -1, 7)
+    if (poses[..., 2] < terrain.PARKED / 2).all():
+        return None  # the task has level ground; its boxes wait below
     half = np.broadcast_to(np.tile(np.array(batch.sizes) / 2, (count, 1)), (len(poses), poses.shape[1], 3))
     return Boxes(poses[..., :3], half, 2 * np.arctan2(poses[..., 6], poses[..., 3]))
 
@@ -180,7 +190,7 @@ def run(options: Evaluate) -> dict[str, Any]:
         weight = float(statics.GRAVITY * robot.build_model(one.robot.name).body_mass.sum())
         stem = f"{number}-{pathlib.Path(one.name).stem}"  # two policies may have the same file name
         for name in wanted:
-            batch, seconds = _batch(name, options, one.robot)
+            batch, seconds = batch_of(name, options, one.robot)
             boxes = boxes_of(batch)
             entry = record["tasks"].setdefault(name, {"ranges": batch.ranges, "seconds": seconds, "policies": {}})
             entry["boxes"] = [] if boxes is None else _boxes_of_first(boxes)
@@ -210,14 +220,17 @@ def _tasks(options: Evaluate, the_robot: robot.Robot) -> tuple[str, ...]:
     if options.script is not None:
         footsteps.load(options.script, the_robot, _ranges(options).usual_sway)  # refused before anything is written
         return (options.script.stem,)
-    for name in options.tasks:
+    wanted = options.tasks or suite.TASKS
+    for name in wanted:
         if name not in suite.TASKS:
             raise config.ConfigError(f"--tasks {name}: no such task; there are: {', '.join(suite.TASKS)}")
-    return options.tasks or suite.TASKS
+        if name not in suite.SCRIPTS:
+            suite.duration(name, sampling.Ranges(), options.seconds)
+    return wanted
 
 
-def _batch(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.Batch, float]:
-    """A task's episodes and how long they last, s."""
+def batch_of(name: str, options: Evaluate, the_robot: robot.Robot) -> tuple[suite.Batch, float]:
+    """The episodes of a task, or of the options' script, and how long they last, s."""
     from bipedtrack import suite
 
     if options.script is not None or name in suite.SCRIPTS:
@@ -338,7 +351,7 @@ def main() -> None:
         page = options.out / "report.html"
         checkpoint.write_text(page, report.page(record))
         print(page)
-    except (ValueError, RuntimeError, OSError) as error:
+    except (Refusal, OSError) as error:
         fail(str(error))
 
 
@@ -352,6 +365,9 @@ def _check(options: Evaluate) -> None:
         raise config.ConfigError(f"--sway {options.sway}: must lie in [0, 1]")
     if not 0.1 <= options.seconds <= 600:
         raise config.ConfigError(f"--seconds {options.seconds}: must lie in [0.1, 600]")
+    least = disturbances.PUSH_AT + _AFTER_PUSH
+    if options.robustness and options.seconds < least:
+        raise config.ConfigError(f"--seconds {options.seconds}: --robustness needs at least {least:g}, for the pushes")
     if options.feedback_ratio is not None and not 0 <= options.feedback_ratio <= 2:
         raise config.ConfigError(f"--feedback-ratio {options.feedback_ratio}: must lie in [0, 2]")
 

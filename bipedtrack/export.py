@@ -26,7 +26,7 @@ class Export:
     out: pathlib.Path = pathlib.Path("policy.npz")
     """The file to write."""
     onnx: pathlib.Path | None = None
-    """Also an ONNX graph from observation to feedback, to write here (needs `bipedtrack[onnx]`)."""
+    """Also an ONNX graph from observation to feedback, to write here (needs `pip install '.[onnx]'`)."""
 
 
 def main() -> None:

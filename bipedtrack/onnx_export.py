@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import pathlib
 from typing import TYPE_CHECKING, Any
 
@@ -120,6 +119,7 @@ def metadata(policy: Policy) -> dict[str, str]:
         "observation_hash": observation.layout_hash(),
         "activation": policy.activation,
         "policy_period": policy.policy_period,
+        "sway": policy.sway,
         "robot": robot.pop("name"),
         **robot,
         **config.to_dict(policy.settings),
@@ -130,16 +130,7 @@ def metadata(policy: Policy) -> dict[str, str]:
 
 def save(policy: Policy, path: str | pathlib.Path) -> None:
     """Writes the graph, whole or not at all. Raises OnnxError, and checkpoint.RunError where it cannot be written."""
-    content = to_onnx(policy).SerializeToString(deterministic=True)
-    path = pathlib.Path(path)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
-    try:
-        unfinished.write_bytes(content)
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise checkpoint.RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    checkpoint.write_bytes(path, to_onnx(policy).SerializeToString(deterministic=True))
 
 
 def require_onnx() -> None:
@@ -147,4 +138,4 @@ def require_onnx() -> None:
     try:
         importlib.import_module("onnx")
     except ImportError:
-        raise OnnxError("the package onnx is not installed; wanted `pip install 'bipedtrack[onnx]'`") from None
+        raise OnnxError("the package onnx is not installed; wanted `pip install '.[onnx]'` in its clone") from None

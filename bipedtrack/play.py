@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from bipedtrack import paths
-from bipedtrack.messages import fail
+from bipedtrack.messages import Refusal, fail
 
 if TYPE_CHECKING:
     from bipedtrack.page import Page
@@ -52,32 +52,32 @@ def shipped() -> dict[str, pathlib.Path]:
 
 
 def choice(given: pathlib.Path | None) -> dict[str, pathlib.Path]:
-    """The policies to choose from, by name; the given one comes first. Raises ValueError where there is none."""
+    """The policies to choose from, by name; the given one comes first. Raises Refusal where there is none."""
     ready = shipped()
     if given is not None:
         name = given.stem if given.suffix == ".npz" else given.name
         ready = {name if name not in ready else str(given): given, **ready}
     if not ready:
-        raise ValueError("no policy comes with this installation; wanted the path of one")
+        raise Refusal("no policy comes with this installation; wanted the path of one")
     return ready
 
 
 def require_free(host: str, port: int) -> None:
-    """Raises ValueError where nobody can listen: the address is unknown or the port taken."""
+    """Raises Refusal where nobody can listen: the address is unknown or the port taken."""
     if not 1 <= port <= 65535:
-        raise ValueError(f"--port {port}: must be from 1 to 65535")
+        raise Refusal(f"--port {port}: must be from 1 to 65535")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as trial:
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind(address)
     except OSError as error:
-        raise ValueError(f"{host}:{port}: cannot listen there ({error.strerror}); wanted another --port or --host") from None
+        raise Refusal(f"{host}:{port}: cannot listen there ({error.strerror}); wanted another --port or --host") from None
 
 
 @contextlib.contextmanager
 def serve(options: Play) -> Iterator[Page]:
-    """A page with a robot that is ready to be driven, until the context ends. Raises ValueError, RuntimeError, OSError."""
+    """A page with a robot that is ready to be driven, until the context ends. Raises Refusal or OSError."""
     import viser
 
     from bipedtrack import policy
@@ -113,7 +113,7 @@ def main() -> None:
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
     if importlib.util.find_spec("viser") is None:
-        fail("the page needs viser; wanted `pip install 'bipedtrack[play]'`")
+        fail("the page needs viser; wanted `pip install '.[play]'` in its clone")
     if options.host not in LOOPBACK:
         print(f"bipedtrack: --host {options.host}: whoever reaches this machine can drive the robot", file=sys.stderr)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs would ignore Ctrl-C's signal
@@ -122,7 +122,7 @@ def main() -> None:
             print(f"drive the robot at http://{options.host}:{options.port} (Ctrl-C ends)", flush=True)
             while True:
                 time.sleep(0.5)  # a signal that another thread got is handled when this one wakes
-    except (ValueError, RuntimeError, OSError) as error:
+    except (Refusal, OSError) as error:
         fail(str(error))
 
 

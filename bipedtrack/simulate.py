@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from bipedtrack import falls, footsteps, kinematics, metrics, nodes, planner, policy, robot, trace
-from bipedtrack.messages import fail
+from bipedtrack.messages import Refusal, fail
 
 
 def model_and_data(script: footsteps.Script, name: str) -> tuple[Any, Any]:
@@ -89,7 +89,7 @@ class Simulate:
     """Drives the robot through a footstep script in MuJoCo C and prints how well it tracked."""
 
     policy: Annotated[pathlib.Path, tyro.conf.Positional]
-    """A policy file."""
+    """A policy file or a run directory."""
     script: Annotated[pathlib.Path, tyro.conf.Positional]
     """A footstep script, CSV."""
     seconds: float | None = None
@@ -102,16 +102,15 @@ def main() -> None:
     """The command line. Exit status 0, also after a fall; 2 for bad input."""
     options = tyro.cli(Simulate, prog="python -m bipedtrack.simulate")
     try:
-        if options.seconds is not None and not 0 < options.seconds < 1e5:
-            raise ValueError(f"--seconds {options.seconds}: must be positive and less than 100000")
+        if options.seconds is not None and not 0.1 <= options.seconds < 1e5:
+            raise Refusal(f"--seconds {options.seconds}: must be at least 0.1 and less than 100000")
         driven = policy.load_for_simulation(options.policy)
         script = footsteps.load(options.script, driven.robot, driven.sway)
         controller = policy.Controller(driven, options.feedback)
         recorded = record(controller, script, options.seconds)
         print(summary(recorded))
-    except (ValueError, RuntimeError, OSError) as error:
+    except (Refusal, OSError) as error:
         fail(str(error))
-    # every refusal of ours is a ValueError or RuntimeError: CheckpointError, PolicyError, ScriptError, RobotError
 
 
 if __name__ == "__main__":

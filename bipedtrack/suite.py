@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bipedtrack import footsteps, plans, robot, sampling, scripts, terrain
+from bipedtrack import config, footsteps, plans, robot, sampling, scripts, terrain
 
 RISERS = (0.05, 0.08, 0.11, 0.14, 0.17)  # m
 TREADS = (0.25, 0.30, 0.35)  # m
@@ -120,8 +120,14 @@ def _lay_out(name: str, steps: int) -> Callable[..., plans.Plan]:
 
 
 def duration(name: str, ranges: sampling.Ranges, seconds: float) -> float:
-    """How long an episode of a random task lasts, s: a hold lasts that long, or 60 s, after the steps before it."""
+    """How long an episode of a random task lasts, s: a hold lasts that long, or 60 s, after the steps before it.
+
+    Raises config.ConfigError where a staircase down is not long enough.
+    """
     if not name.startswith("hold-"):
+        most = terrain.TREADS_DOWN * ranges.period[0]
+        if _what(name).kind == "stairs" and _what(name).down_share > 0 and seconds > most:
+            raise config.ConfigError(f"--seconds {seconds:g}: {name}: its {terrain.TREADS_DOWN} treads last {most:g} s")
         return seconds
     longest = (ranges.squat_period if _what(name).kind == "squat" else ranges.period)[2]
     return HOLD_AFTER[1] * longest + (LONG_HOLD if name in LONG_HOLDS else seconds)

@@ -22,12 +22,11 @@ from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array
 from bipedtrack.sampling import SIDLE, SQUAT, STAIRS, WALK, WANDER, Distribution, sample, within
 
-MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs
+MIX_STEPS = 4  # task steps of one kind in an episode of many; even, for a sidle is made of pairs, but for breaks
 ERRORS = ("ankle_error_cm", "ankle_yaw_error_deg", "trunk_error_cm", "trunk_error_deg")  # of `tracking_errors`
 _BREAKS = (2.0, 7.0)  # task steps from one break to the next, and one more than the most
 _CLEARANCE = 0.02  # m between a sole and the edge of a tread that it is led over
 _MARGIN = 0.015  # m before its toe and behind its heel, of which 1 cm is the contact spheres'
-_TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
 
 
 class Motion(NamedTuple):
@@ -132,7 +131,7 @@ def begin(key: Array, given: Distribution, robot: Robot) -> tuple[Task, Nodes]:
     still, on_stairs, ranges = motion.kind <= SQUAT, motion.kind == STAIRS, given.ranges
     down = u[0] < given.down_share
     rise = jnp.where(on_stairs, jnp.where(down, -draw["stair_riser"], draw["stair_riser"]), 0.0)
-    stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -_TREADS_DOWN * rise, 0.0))
+    stairs = terrain.Stairs(rise, draw["stair_tread"], jnp.where(on_stairs & down, -terrain.TREADS_DOWN * rise, 0.0))
     hold_after = jnp.floor(within(u[2], given.hold_after + jnp.array([0.0, 1.0])))
     v: Array = jax.random.uniform(jax.random.fold_in(key_task, 1), (3,))
     breaks = (v[0] < given.break_share) & ~still

@@ -34,7 +34,7 @@ import numpy as np
 import tyro
 
 from bipedtrack import follower, footsteps, kinematics, packets, paths, policy, simulate, trace
-from bipedtrack.messages import fail
+from bipedtrack.messages import Refusal, fail
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 
 PORT = 47200
@@ -206,7 +206,7 @@ class Teleop:
     """Drives the robot in MuJoCo C by node targets that come over UDP; ends with Ctrl-C."""
 
     policy: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
-    """A policy file. Default: the one that ships."""
+    """A policy file or a run directory. Default: the policy that ships."""
     host: str = "127.0.0.1"
     """The address to listen on; another one than this computer's own lets others steer."""
     port: int = PORT
@@ -226,15 +226,17 @@ def main() -> None:
     options = tyro.cli(Teleop, prog="python -m bipedtrack.teleop")
     try:
         if options.seconds is not None and not 0 < options.seconds < 1e5:
-            raise ValueError(f"--seconds {options.seconds}: must be positive and less than 100000")
+            raise Refusal(f"--seconds {options.seconds}: must be positive and less than 100000")
         if not 0.01 <= options.hold <= 60:
-            raise ValueError(f"--hold {options.hold}: must lie between 0.01 and 60")
+            raise Refusal(f"--hold {options.hold}: must lie between 0.01 and 60")
         if not 0 <= options.port < 65536:
-            raise ValueError(f"--port {options.port}: must lie between 0 and 65535")
+            raise Refusal(f"--port {options.port}: must lie between 0 and 65535")
         if options.record is not None and options.seconds is None:
-            raise ValueError("--record needs --seconds")
+            raise Refusal("--record needs --seconds")
+        if options.record is not None and options.record.suffix != ".npz":
+            raise Refusal(f"--record {options.record}: wanted a name that ends in .npz")
         if options.record is not None and not options.record.parent.is_dir():
-            raise ValueError(f"--record {options.record}: there is no such folder")
+            raise Refusal(f"--record {options.record}: there is no such folder")
         file = options.policy or paths.data_dir("models") / "policies" / "best.npz"
         driven = policy.load_for_simulation(file)
         script = footsteps.load(options.ground, driven.robot) if options.ground else LEVEL_GROUND
@@ -246,9 +248,8 @@ def main() -> None:
         if options.record and rows:
             trace.save(simulate.to_trace(rows), options.record)
             print(options.record)
-    except (ValueError, RuntimeError, OSError) as error:
+    except (Refusal, OSError) as error:
         fail(str(error))
-    # every refusal of ours is a ValueError or RuntimeError: CheckpointError, PolicyError, ScriptError, RobotError
 
 
 if __name__ == "__main__":

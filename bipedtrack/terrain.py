@@ -18,6 +18,7 @@ from bipedtrack.rotations import Array, namespace
 
 STAIR_BOX = (1.2, 2.0, 0.4)  # length, width, height of a tread's box, m
 STAIR_BOXES = 3
+TREADS_DOWN = 30  # a staircase down starts this many treads above the ground
 PARKED = -10.0  # m, where a box that is not needed waits
 TOLERANCE = 1e-3  # m: what is this close counts as touching or standing
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from bipedtrack import doctor, footsteps, policy, robot, simulate
+from bipedtrack import checkpoint, doctor, footsteps, policy, robot, simulate
 from bipedtrack.messages import Refusal, fail
 from bipedtrack.pictures import COLORS, render
 from bipedtrack.trace import Trace
@@ -133,7 +133,7 @@ class _Discard(Exception):
 @contextlib.contextmanager
 def _whole_file(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """A place beside `path` whose file is moved there at the end, or removed after an error. Raises VideoError."""
-    unfinished = path.absolute().with_name(f"{path.name}.{os.getpid()}.unfinished")
+    unfinished = path.absolute().with_name(f"{path.name}.{os.getpid()}{checkpoint.UNFINISHED}")
     try:
         yield unfinished
         os.replace(unfinished, path)
@@ -231,7 +231,7 @@ def main() -> None:
         print(simulate.summary(recorded))
         model = robot.build_model(driven.robot.name, sizes)
         count = film(model, driven.robot, recorded, options.out, boxes, options.size, options.fps)
-    except (ValueError, RuntimeError, OSError) as error:
+    except (Refusal, OSError) as error:
         fail(str(error))
     print(f"{options.out}: {count} pictures in {time.monotonic() - began:.0f} s")
 
@@ -251,14 +251,18 @@ def _record_task(options: Video, driven: policy.Policy) -> _Recorded:
     """An episode just as the evaluation has it."""
     import jax
 
-    from bipedtrack import evaluate, plans, sampling, suite
+    from bipedtrack import evaluate, plans, suite
 
     if options.task not in suite.TASKS:
-        raise ValueError(f"--task {options.task}: no such task; there are: {', '.join(suite.TASKS)}")
-    asked = evaluate.Evaluate((str(options.policy),), feedback_ratio=None if options.feedback else 0.0)
-    ranges = sampling.Ranges().swaying(driven.sway)
-    seconds = suite.duration(options.task, ranges, options.seconds or asked.seconds)
-    batch = suite.batch(options.task, ranges, driven.robot, options.episode + 1, seconds, asked.seed)
+        raise Refusal(f"--task {options.task}: no such task; there are: {', '.join(suite.TASKS)}")
+    asked = evaluate.Evaluate(
+        policies=(str(options.policy),),
+        episodes=options.episode + 1,
+        seconds=options.seconds or evaluate.Evaluate.seconds,
+        sway=driven.sway,
+        feedback_ratio=None if options.feedback else 0.0,
+    )
+    batch, seconds = evaluate.batch_of(options.task, asked, driven.robot)
     batch = batch._replace(plan=jax.tree.map(lambda leaf: leaf[-1:], batch.plan))
     engines = evaluate.Engines(evaluate.subject(asked.policies[0], asked), "mujoco")
     recorded = engines.record("mujoco", batch, seconds).episode(0)
@@ -268,17 +272,17 @@ def _record_task(options: Video, driven: policy.Policy) -> _Recorded:
 
 
 def _check(options: Video) -> None:
-    """Raises ValueError for options that make no film."""
+    """Raises Refusal for options that make no film."""
     if (options.task is None) == (options.script is None):
-        raise ValueError("name what to film: either --task or --script")
+        raise Refusal("name what to film: either --task or --script")
     if not 0 <= options.episode < 10_000:
-        raise ValueError(f"--episode {options.episode}: must be from 0 to 9999")
+        raise Refusal(f"--episode {options.episode}: must be from 0 to 9999")
     if options.seconds is not None and not 0.1 <= options.seconds < 1e5:
-        raise ValueError(f"--seconds {options.seconds}: must be at least 0.1 and less than 100000")
+        raise Refusal(f"--seconds {options.seconds}: must be at least 0.1 and less than 100000")
     if not all(16 <= side <= 4096 for side in options.size):
-        raise ValueError(f"--size {options.size[0]} {options.size[1]}: both must be from 16 to 4096 pixels")
+        raise Refusal(f"--size {options.size[0]} {options.size[1]}: both must be from 16 to 4096 pixels")
     if not 1 <= options.fps <= 100:
-        raise ValueError(f"--fps {options.fps}: must be from 1 to 100")
+        raise Refusal(f"--fps {options.fps}: must be from 1 to 100")
 
 
 if __name__ == "__main__":

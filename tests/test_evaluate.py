@@ -20,7 +20,7 @@ from policies import small_policy
 from traces import by_mujoco
 
 import bipedtrack
-from bipedtrack import evaluate, footsteps, kinematics, metrics, policy, statics, suite, trace
+from bipedtrack import evaluate, footsteps, kinematics, metrics, policy, sampling, statics, suite, trace
 from bipedtrack import robot as robots
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 
@@ -140,6 +140,8 @@ REFUSALS = {  # the arguments and a part of the line
     "ik --sway 1.5": "--sway 1.5: must lie in [0, 1]",
     "ik --seconds 0": "--seconds 0.0: must lie in [0.1, 600]",
     "ik --seconds nan": "--seconds nan: must lie in [0.1, 600]",
+    "ik --tasks stand stairs-down --seconds 12.1": "--seconds 12.1: stairs-down: its 30 treads last 12 s",
+    "ik --robustness --seconds 5.9": "--seconds 5.9: --robustness needs at least 6, for the pushes",
     "ik --feedback-ratio 3": "--feedback-ratio 3.0: must lie in [0, 2]",
     "ik --filter 0": "filter must lie in (0, 1], not 0.0",
     "ik --out cut.npz": "cut.npz",
@@ -176,6 +178,13 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     assert said.err.startswith("bipedtrack: ") and wanted in said.err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "cut.npz", "empty", "straight.npz", "sways.npz"]
+
+
+def test_only_what_stands_on_the_ground_counts_for_the_clearance(robot: robots.Robot) -> None:
+    batches = {name: suite.batch(name, sampling.Ranges(), robot, 2, 1.0, 5) for name in ("walk-forward", "stairs-up")}
+    assert evaluate.boxes_of(batches["walk-forward"]) is None
+    boxes = evaluate.boxes_of(batches["stairs-up"])
+    assert boxes is not None and (boxes.centres[..., 2] + boxes.half_sizes[..., 2]).max() > 0.02
 
 
 # Ablations

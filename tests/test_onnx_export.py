@@ -96,7 +96,7 @@ def test_metadata_say_all_that_a_controller_around_the_graph_needs(robot: Robot)
     found = {key: json.loads(value) for key, value in session.get_modelmeta().custom_metadata_map.items()}
     assert list(found["observation_layout"].items()) == list(observation.WIDTHS._asdict().items())
     assert found["observation_hash"] == observation.layout_hash()
-    assert found["policy_period"] == 0.02
+    assert found["policy_period"] == 0.02 and found["sway"] == policy.sway
     assert found["filter"] == 0.35 and found["feedback_scale"] == 0.45
     assert found["level_feet"] is True and found["velocity_feedforward"] is False
     assert found["provenance"] == {"seed": 3, "steps": 4}
@@ -133,4 +133,4 @@ except onnx_export.OnnxError as error:
     print(error)
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
-    assert found.stdout == "the package onnx is not installed; wanted `pip install 'bipedtrack[onnx]'`\n", found.stderr
+    assert found.stdout == "the package onnx is not installed; wanted `pip install '.[onnx]'` in its clone\n", found.stderr

@@ -11,6 +11,7 @@ import pytest
 from ports import free_port
 
 from bipedtrack import play
+from bipedtrack.messages import Refusal
 
 pytest.importorskip("viser")
 
@@ -55,7 +56,7 @@ def test_it_serves_until_interrupted_and_warns_where_others_may_come_in() -> Non
     ("host", "port", "words"), [("127.0.0.1", 0, "1 to 65535"), ("no such host", 8080, "cannot listen")]
 )
 def test_an_address_that_cannot_be(host: str, port: int, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(Refusal, match=words):
         play.require_free(host, port)
 
 
@@ -65,7 +66,7 @@ def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, 
     with pytest.raises(SystemExit) as left:
         play.main()
     assert left.value.code == 2
-    assert "bipedtrack[play]" in capsys.readouterr().err
+    assert ".[play]" in capsys.readouterr().err
 
 
 def test_the_shipped_policy_comes_first_and_a_given_one_before_it(tmp_path: Path) -> None:
