@@ -1,4 +1,4 @@
-# Needs Python 3.11 or 3.12, pip, make and git; everything else goes into .venv.
+# Needs Python 3.11 or 3.12, pip and make; everything else goes into .venv.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 ARGS ?=
 BIN := .venv/bin
@@ -14,7 +14,7 @@ setup: $(INSTALLED)
 $(INSTALLED): requirements.lock pyproject.toml
 	@'$(PYTHON)' -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))' 2>/dev/null || \
 	  { echo "bipedtrack needs Python 3.11 or 3.12; name one with: make PYTHON=/path/to/python3.11" >&2; exit 1; }
-	@echo "installing the locked packages into .venv (once; a few minutes)"
+	@echo "installing the locked packages into .venv (once; about a minute)"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || '$(PYTHON)' -m venv .venv >/dev/null 2>&1 || $(VENV_BY_PIP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .

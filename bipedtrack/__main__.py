@@ -12,7 +12,7 @@ COMMANDS = {
     "curves": "draw the learning curves of training runs side by side",
     "evaluate": "measure the tracking error of every step, on two simulators",
     "play": "drive the robot in a browser",
-    "video": "film a policy on a footstep script",
+    "video": "film a policy at a task or on a footstep script",
     "doctor": "check versions, devices, rendering and the physics of this machine",
 }
 

@@ -66,7 +66,7 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Any], meta: dict[str, Any
         "meta": meta,
     }
     encoded = np.frombuffer(json.dumps(manifest, default=_plain).encode(), np.uint8)
-    _write_atomically(Path(path), _pack({_MANIFEST: encoded, **contents}))
+    write_bytes(path, _pack({_MANIFEST: encoded, **contents}))
 
 
 def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -162,17 +162,38 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape).copy()
 
 
-# Text files
+# Other files
 
 
 def write_json(path: str | Path, content: Any) -> None:
     """Writes `content` as JSON, atomically. Numbers that are not finite become null. Raises RunError."""
-    _write_atomically(Path(path), (_strict_json(content, indent=2) + "\n").encode())
+    write_bytes(path, (_strict_json(content, indent=2) + "\n").encode())
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Writes a text file in UTF-8, atomically. Raises RunError when it cannot be written."""
-    _write_atomically(Path(path), text.encode())
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Puts `content` at `path`, whole or not at all, even if the power fails. Raises RunError when it cannot be written."""
+    path = Path(path)
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
+    with os_errors(path, "written"):
+        try:
+            with open(unfinished, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        except BaseException:
+            unfinished.unlink(missing_ok=True)
+            raise
+        directory = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(directory)  # the new name, too, must be on the disk
+        finally:
+            os.close(directory)
 
 
 def append_jsonl(path: str | Path, record: Any) -> None:
@@ -202,26 +223,6 @@ def _plain(value: Any) -> Any:
     if not hasattr(value, "tolist"):
         raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
     return value.tolist()
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    """Puts `content` at `path`, whole or not at all, even if the power fails. Raises RunError."""
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
-    with os_errors(path, "written"):
-        try:
-            with open(unfinished, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(unfinished, path)
-        except BaseException:
-            unfinished.unlink(missing_ok=True)
-            raise
-        directory = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)  # the new name, too, must be on the disk
-        finally:
-            os.close(directory)
 
 
 @contextlib.contextmanager

@@ -25,7 +25,7 @@ class ControlConfig:
     feedback_scale: float = 0.2  # feedback = clip(scale x network output, -1, 1)
     level_feet: bool = False  # feedforward keeps the soles level in the world (eq 1: parallel to the trunk)
     velocity_feedforward: bool = False  # adds (kd/kp) dq/dt, which cancels the PD's damping of the wanted motion
-    gravity_feedforward: bool = False  # adds the torques that hold the commanded posture up, over kp (`statics.load`)
+    gravity_feedforward: bool = False  # adds the posture's torques over kp (`statics.load`); a foot with T = 0 is down
     integral: float = 0.0  # 1/s: adds that times the integral of what the joints lack at rest (`integrate`)
 
     def __post_init__(self) -> None:

@@ -58,7 +58,8 @@ def read(run: pathlib.Path, smooth: int = 1) -> dict[str, np.ndarray]:
     """
     file = run / "progress.jsonl"
     try:
-        records = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        whole, _, _ = file.read_text(encoding="utf-8").rpartition("\n")  # after a power cut the last line may be cut off
+        records = [json.loads(line) for line in whole.splitlines()]
         rows = [[float("nan" if r[name] is None else r[name]) for name in ("steps", *PANELS)] for r in records]
     except OSError as error:
         raise Refusal(f"{file}: cannot be read ({error.strerror or error}); wanted a run directory") from None

@@ -180,6 +180,7 @@ class Drive:
     def steer(self, **wishes: float) -> None:
         """Changes wishes by the names of Steering, from the next task step on; a script under way is left."""
         self._require_standing()
+        self.note = ""
         if self.mode is Mode.SCRIPT:
             self._steer_on("steering by hand")
         asked = steering.clamped(self.steering._replace(**wishes))
@@ -188,7 +189,6 @@ class Drive:
             trunk=self.wishes.trunk or any(name.startswith("trunk") for name in wishes),
             placed=None if asked.moves else self.wishes.placed,
         )
-        self.note = ""
 
     def stop(self) -> None:
         """Feet come together at the next task step; then every target holds."""

@@ -1,7 +1,8 @@
 """The trained policy: the actor as a function, the file it travels in, and the controller that runs anywhere numpy runs.
 
-A policy file holds everything that acts between a command and the joint targets (network, normaliser, robot, control law,
-observation layout), so an exported policy cannot act otherwise than in training because something was left behind.
+A policy file holds all that was chosen of what acts between a command and the joint targets (network, normaliser, robot,
+settings of the control law, observation layout), so an exported policy does not act otherwise than in training because
+something was left behind; the law itself is this package's code.
 """
 
 from __future__ import annotations

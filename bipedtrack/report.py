@@ -6,10 +6,11 @@ missing.
 
 from __future__ import annotations
 
+import math
 import shlex
 from typing import Any
 
-from bipedtrack import comparisons, markup, metrics, sheets, swings, verdicts
+from bipedtrack import comparisons, falls, markup, metrics, sheets, swings, verdicts
 from bipedtrack.markup import escape, section
 from bipedtrack.record import ENGINES, engines_of, get, labels_of, number
 
@@ -126,8 +127,9 @@ _DEFINITIONS = f"""<ul>
 <li><b>Error</b>: distance of a node from its real-time target of the same instant, at each control step before a fall, in
 cm; yaw of the ankles and whole rotation of the trunk, in deg. Mean, median, 95th percentile (95 %) and maximum are over all
 steps of all episodes; over time, the mean over the robots that have not fallen.</li>
-<li><b>Without a fall</b>: share of episodes that last to the end, with Wilson's 95 % interval. Time to fall: mean of those
-that fall; median of all, if half of them fall.</li>
+<li><b>Without a fall</b>: share of episodes that last to the end, with Wilson's 95 % interval. A fall is a trunk tilted by
+{math.degrees(falls.TILT):.0f} deg or {falls.DEPTH:g} m below its target, or an ankle {falls.LOST_ANKLE:g} m off its own.
+Time to fall: mean of those that fall; median of all, if half of them fall.</li>
 <li><b>Interval of an error</b>: of the mean over the means of the episodes, by Student's t.</li>
 <li><b>Footholds</b>: the ankle against its foothold at the planned instant, whether the foot is down or not. The time is
 when the ground first bears more than {100 * metrics.CONTACT_SHARE:g} % of the weight, from the middle of the swing to half

@@ -1,7 +1,8 @@
 """The reward of eqs (11)-(16), term by term.
 
-Terms and weights are one struct type, so a misspelt weight cannot load. Two readings differ from the print: eqs (13), (14)
-use the real-time target (superscript t) and the sums of eqs (15), (16) are of absolute values with a negative sign.
+Terms and weights are one struct type, so a misspelt weight cannot load. Three readings differ from the print: eqs (13),
+(14) use the real-time target (superscript t); the sums of eqs (15), (16) are of absolute values with a negative sign; and
+(16) holds where all targets stand still, as the sentence before it says, not where they move.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from bipedtrack.rotations import Array, namespace
 
 
 class Terms(NamedTuple):
-    """The terms of one control step before weighting, each a scalar array (), or their weights w, each a float."""
+    """The terms of one policy step before weighting, each a scalar array (), or their weights w, each a float."""
 
-    live: float  # r_live, eq (11): 1 while the robot has not fallen
+    live: float  # r_live, eq (11): 1 at every step, of which a fall takes away those that would follow
     trunk_position: float  # eq (13), in (0, 1]
     trunk_orientation: float  # eq (13), in (0, 1]
     left_ankle_position: float  # eq (14), in (0, 1]

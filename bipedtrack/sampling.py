@@ -18,7 +18,11 @@ STAND, SQUAT, WALK, SIDLE, TURN, WANDER, STAIRS = range(len(KINDS))
 
 
 class Ranges(NamedTuple):
-    """Table II as ranges: (lowest, mildest, highest) at full difficulty; at difficulty 0 all is mildest."""
+    """Table II as ranges: (lowest, mildest, highest) at full difficulty; at difficulty 0 all is mildest.
+
+    An episode draws its motion from them; `step_variation` then goes up to a fifth beyond them from step to step, but for
+    the period, which stays inside.
+    """
 
     period: tuple[float, float, float] = (0.4, 0.55, 0.7)  # s, of a task step with a swing foot
     walk_step: tuple[float, float, float] = (-0.15, 0.0, 0.25)  # m the trunk advances; a foot travels twice that
@@ -45,7 +49,7 @@ class Ranges(NamedTuple):
     foot_x: tuple[float, float, float] = (-0.1, 0.0, 0.1)  # m, left foot ahead of the right (stand, squat)
     foot_distance: tuple[float, float, float] = (0.17, 0.20, 0.30)  # m
     foot_yaw: tuple[float, float, float] = (-0.2, 0.0, 0.2)  # rad
-    squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s
+    squat_period: tuple[float, float, float] = (0.5, 1.0, 1.5)  # s, of a way of the trunk; the paper prints no such time
     wander_x: tuple[float, float, float] = (-0.10, 0.0, 0.25)  # m, of a foothold from beside the other foot, ahead
     wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.15)  # m, outwards
     wander_yaw: tuple[float, float, float] = (-0.25, 0.0, 0.25)  # rad

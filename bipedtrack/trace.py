@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import pathlib
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from bipedtrack import checkpoint
 from bipedtrack.nodes import Nodes
 
 
@@ -49,11 +51,16 @@ def _pick(part: Any, index: int | slice | np.ndarray) -> Any:
 
 
 def save(trace: Trace, path: str | pathlib.Path) -> None:
-    """Writes a trace as .npz, one array a field (`target_trunk_position` and so on), for anyone to check."""
+    """Writes a trace as .npz, one array a field (`target_trunk_position` and so on), for anyone to check.
+
+    Raises checkpoint.RunError when it cannot be written.
+    """
     arrays: dict[str, np.ndarray] = {}
     for name, part in trace._asdict().items():
         if isinstance(part, Nodes):
             arrays |= {f"{name}_{node}": array for node, array in part._asdict().items()}
         else:
             arrays[name] = part
-    np.savez_compressed(path, allow_pickle=False, **arrays)
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **arrays)
+    checkpoint.write_bytes(path, content.getvalue())

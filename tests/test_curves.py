@@ -29,6 +29,13 @@ def test_of_what_was_trained_twice_the_latter_counts(tmp_path: pathlib.Path) -> 
     assert found["steps"].tolist() == [10, 20, 30, 40] and found["falls"].tolist() == [1, 4, 5, 6]
 
 
+def test_a_last_line_that_was_cut_off_is_not_there_yet(tmp_path: pathlib.Path) -> None:
+    run = run_of(tmp_path / "run", {"steps": 5}, {"steps": 6})
+    with open(run / "progress.jsonl", "a") as file:
+        file.write('{"stage": "ground", "fal')
+    assert curves.read(run)["steps"].tolist() == [5, 6]
+
+
 def test_smoothing_takes_the_mean_of_known_values_on_both_sides(tmp_path: pathlib.Path) -> None:
     falls = [1.0, 2.0, None, 6.0, 8.0]
     run = run_of(tmp_path / "run", *({"steps": i + 1, "falls": f} for i, f in enumerate(falls)))
@@ -56,9 +63,9 @@ def test_curves_are_drawn_where_their_figures_are(tmp_path: pathlib.Path) -> Non
     [
         (None, "progress.jsonl: cannot be read"),
         ("", "has no record yet"),
-        ('{"steps": 1', "is damaged"),
-        ('{"steps": 1}', "is damaged (KeyError: 'falls')"),
-        ("3", "is damaged"),
+        ('{"steps": 1\n', "is damaged"),
+        ('{"steps": 1}\n', "is damaged (KeyError: 'falls')"),
+        ("3\n", "is damaged"),
     ],
 )
 def test_what_is_no_run_is_refused_in_one_line(tmp_path: pathlib.Path, content: str | None, words: str) -> None:

@@ -60,6 +60,18 @@ def test_a_run_that_began_with_a_checkpoint_has_it_until_its_own_first_one(tmp_p
         run.latest()
 
 
+def test_a_run_from_nothing_does_not_begin_with_what_another_one_left(tmp_path):
+    class Unwritable:
+        pass
+
+    with pytest.raises(TypeError):  # after start.npz, before run.json
+        RunDirectory.create(tmp_path / "run", {"x": Unwritable()}, checkpoint.Checkpoint(7, numbers(7), {}))
+    assert (tmp_path / "run" / "start.npz").exists()
+    run = RunDirectory.create(tmp_path / "run", {})
+    assert run.latest() is None and files(run) == ["lock", "run.json"]
+    run.close()
+
+
 def test_checkpoints_are_ordered_as_numbers(run):
     for index in (9998, 9999, 10000, 10001):
         run.save_checkpoint(index, numbers(index), {})
