@@ -91,8 +91,7 @@ class Page:
             self._add_watching()
         self._add_keys()
         self._add_handles()
-        # whoever leaves lets go
-        server.on_client_disconnect(lambda _: self.scene.held.clear())
+        server.on_client_disconnect(lambda client: self._let_go(client.client_id))
 
     def run(self) -> None:
         """Draws until `stop`, 30 times a second, the plots and texts 5 times, while somebody looks on."""
@@ -306,19 +305,27 @@ class Page:
             command.on_trigger(lambda _, request=request: request())  # type: ignore[misc]
 
     def _add_handles(self) -> None:
-        self.scene.foot.on_update(lambda event: self._drag("foot", event.phase, self._place_foot, self._reaches_foot))
-        self.scene.trunk.on_update(lambda event: self._drag("trunk", event.phase, self._place_trunk, self._reaches_trunk))
+        foot, trunk = ("foot", self._place_foot, self._reaches_foot), ("trunk", self._place_trunk, self._reaches_trunk)
+        self.scene.foot.on_update(lambda event: self._drag(*foot, event.phase, event.client_id))
+        self.scene.trunk.on_update(lambda event: self._drag(*trunk, event.phase, event.client_id))
 
-    def _drag(self, handle: str, phase: str, place: Callable[[], None], reaches: Callable[[], bool]) -> None:
-        """The robot waits while somebody holds a handle, and follows when it is let go."""
+    def _let_go(self, viewer: int) -> None:
+        """What a viewer who leaves holds is free again."""
+        for handle in [name for name, holder in self.scene.held.items() if holder == viewer]:
+            self.scene.held.pop(handle, None)
+
+    def _drag(
+        self, handle: str, place: Callable[[], None], reaches: Callable[[], bool], phase: str, viewer: int | None
+    ) -> None:
+        """The robot waits while a viewer holds a handle, and follows when it is let go."""
         if phase == "start":
-            self.scene.held.add(handle)
+            self.scene.held[handle] = viewer
             self._ask(Drive.lead)
         elif phase == "end":
             try:
                 place()
             finally:
-                self.scene.held.discard(handle)
+                self.scene.held.pop(handle, None)
         elif handle in self.scene.held:
             within_reach = reaches()
             in_loop(self._server, lambda: self.scene.mark(handle, within_reach))

@@ -75,7 +75,8 @@ class Scene:
             "/world/next_trunk/box", dimensions=(0.3, 0.3, 0.15), color=TARGET_COLOR, opacity=0.25, cast_shadow=False
         )
         self._trunk_asked: tuple[Nodes, Steering] | None = None  # to which `_trunk_end` belongs
-        self.held: set[str] = set()  # handles in somebody's hand, "foot" or "trunk": they stay where they are held
+        # the viewer in whose hand a handle is, "foot" or "trunk": it stays where it is held
+        self.held: dict[str, int | None] = {}
 
     @property
     def _plate(self) -> tuple[float, float, float]:

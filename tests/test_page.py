@@ -71,24 +71,35 @@ def test_the_clock_runs_at_real_time_without_a_viewer(page: Page) -> None:
 def test_a_foothold_out_of_reach_turns_red_and_the_robot_goes_to_the_nearest(page: Page) -> None:
     handle = page.scene.foot
     foot = page.clock.view.next_foot.foot
-    page._drag("foot", "start", page._place_foot, page._reaches_foot)
+    page._drag("foot", page._place_foot, page._reaches_foot, "start", 1)
     handle.position = np.array([0.2, 0.12 if foot == 0 else -0.12, 0.0])
-    page._drag("foot", "update", page._place_foot, page._reaches_foot)
+    page._drag("foot", page._place_foot, page._reaches_foot, "update", 1)
     assert tuple(page.scene._foot_plate.color) != OUT_OF_REACH_COLOR
     handle.position = np.array([3.0, 0.1 if foot == 0 else -0.1, 0.0])
-    page._drag("foot", "update", page._place_foot, page._reaches_foot)
+    page._drag("foot", page._place_foot, page._reaches_foot, "update", 1)
     assert tuple(page.scene._foot_plate.color) == OUT_OF_REACH_COLOR
-    page._drag("foot", "end", page._place_foot, page._reaches_foot)
+    page._drag("foot", page._place_foot, page._reaches_foot, "end", 1)
     wait_until(lambda: page.clock.view.measured.ankle_positions[foot, 0] > 0.3)
     assert page.clock.view.mode is Mode.STEER
 
 
 def test_the_trunk_follows_its_handle(page: Page) -> None:
-    page._drag("trunk", "start", page._place_trunk, page._reaches_trunk)
+    page._drag("trunk", page._place_trunk, page._reaches_trunk, "start", 1)
     page.scene.trunk.position = np.array([0.0, 0.0, 0.68])
-    page._drag("trunk", "end", page._place_trunk, page._reaches_trunk)
+    page._drag("trunk", page._place_trunk, page._reaches_trunk, "end", 1)
     assert page.clock.ask(lambda drive: drive.steering.trunk_height) == pytest.approx(0.68, abs=0.005)
     wait_until(lambda: page.clock.view.qpos[2] < 0.71)
+
+
+def test_whoever_leaves_lets_go_of_what_is_in_that_hand_alone(page: Page) -> None:
+    page._drag("foot", page._place_foot, page._reaches_foot, "start", 1)
+    page._drag("trunk", page._place_trunk, page._reaches_trunk, "start", 2)
+    page._let_go(3)
+    assert page.scene.held == {"foot": 1, "trunk": 2}
+    page._let_go(1)
+    assert page.scene.held == {"trunk": 2}
+    page._let_go(2)
+    assert not page.scene.held
 
 
 def test_pause_slow_motion_and_single_steps(page: Page) -> None:
@@ -253,9 +264,9 @@ def test_viewers_are_sent_to_from_one_thread_alone(tab: Tab, page: Page, monkeyp
     page._toggle_pause()
     page._say("a sentence")
     page._write_down()
-    page._drag("foot", "start", page._place_foot, page._reaches_foot)
-    page._drag("foot", "update", page._place_foot, page._reaches_foot)
-    page._drag("foot", "end", page._place_foot, page._reaches_foot)
+    page._drag("foot", page._place_foot, page._reaches_foot, "start", 1)
+    page._drag("foot", page._place_foot, page._reaches_foot, "update", 1)
+    page._drag("foot", page._place_foot, page._reaches_foot, "end", 1)
     tab.click("Watch")
     time.sleep(1.0)
     assert len(kinds) >= 4  # there was something to send
