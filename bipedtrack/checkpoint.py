@@ -1,4 +1,4 @@
-"""Verified array files, and text files that are written whole or not at all.
+"""Verified array files, and other files that are written whole or not at all.
 
 An array file (a checkpoint, a policy) is an uncompressed `.npz` that numpy can read, with two additions. Its
 entry `__manifest__` is JSON: format, version, kind, a `meta` dict, and each array's name, shape, dtype and

@@ -90,21 +90,15 @@ def mjcf_path(name: str) -> pathlib.Path:
 
 def load(name: str = "ranger_max") -> Robot:
     """The constants of a robot, in float64. Raises RobotError or config.ConfigError in one line."""
-    path = mjcf_path(name)
-    description = config.load(Description, path.with_suffix(".toml"))
-    return from_model(name, _spec(path).compile(), description)
-
-
-def _spec(path: pathlib.Path) -> Any:
-    """MuJoCo's specification of an MJCF. Raises RobotError where it is no MJCF that compiles."""
     import mujoco
 
+    path = mjcf_path(name)
+    description = config.load(Description, path.with_suffix(".toml"))
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compile()
+        model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise RobotError(f"{path}: is no MJCF that MuJoCo compiles: {' '.join(str(error).split())}") from None
-    return spec
+    return from_model(name, model, description)
 
 
 def from_model(name: str, model: Any, description: Description) -> Robot:
@@ -165,7 +159,7 @@ def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: boo
     """
     import mujoco
 
-    spec = _spec(mjcf_path(name))
+    spec = mujoco.MjSpec.from_file(str(mjcf_path(name)))
     for i, size in enumerate(boxes):
         body = spec.worldbody.add_body(name=f"box_{i}", mocap=True, pos=[0, 0, -10.0 - i])
         body.add_geom(

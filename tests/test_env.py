@@ -290,10 +290,8 @@ def test_robots_stand_on_the_boxes_of_their_stairs(on_stairs: Compiled, robot: r
 
 def test_a_fall_ends_the_episode_of_that_robot_alone(flat: Compiled, mixed: list[Any]) -> None:
     physics = mixed[0].pipeline_state
-    roll = math.radians(70) / 2
-    qpos = (
-        physics.qpos.at[3, 3:7].set(jnp.array([math.cos(roll), math.sin(roll), 0, 0])).at[5, 2].add(-0.8).at[3, 2].add(1.0)
-    )
+    tilted = jnp.array([math.cos(math.radians(35)), math.sin(math.radians(35)), 0, 0])
+    qpos = physics.qpos.at[3, 3:7].set(tilted).at[5, 2].add(-0.8).at[3, 2].add(1.0)
     after = flat.step(mixed[0].replace(pipeline_state=physics._replace(qpos=qpos)), jnp.zeros((ROBOTS, 12)))
     np.testing.assert_array_equal(after.done, [0, 0, 0, 1, 0, 1, 0, 0])
     np.testing.assert_array_equal(after.metrics["fell"], after.done)

@@ -1,11 +1,6 @@
 """The robot of Table I, on the compiled model: masses, lengths, inertias, joints, gains, contacts, solver."""
 
-import dataclasses
-import json
 import math
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,11 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from bipedtrack import config, footsteps, policy
+from bipedtrack import config
 from bipedtrack import robot as robots
 from bipedtrack.robot import LEGS, Description, Robot, RobotError
 
-ROOT = Path(__file__).resolve().parent.parent
 # per leg, hip to foot: axis, range in deg, kp, kd, torque limit
 JOINTS = {
     "hip_yaw": ((0, 0, 1), (-45, 45), 500, 25, 150),
@@ -369,44 +363,3 @@ def test_a_description_that_makes_no_sense_is_refused(line: str, message: str, t
     file.write_text("\n".join([line if old.startswith(key) else old for old in lines]))
     with pytest.raises(config.ConfigError, match=message):
         config.load(Description, file)
-
-
-# A robot of one's own
-
-
-def test_another_robot_is_simulated_and_evaluated_as_itself(tmp_path: Path) -> None:
-    # a checkout with one robot, a heavier one of another name
-    for name in ("bipedtrack", "curricula"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "*.md"))
-    (tmp_path / "models" / "heavy").mkdir(parents=True)
-    source = robots.mjcf_path("ranger_max")
-    mjcf, trunk = source.read_text(), 'size="0.15 0.15 0.075" mass="20"'
-    assert trunk in mjcf
-    (tmp_path / "models/heavy/heavy.xml").write_text(mjcf.replace(trunk, trunk.replace("20", "23")))
-    shutil.copy(source.with_suffix(".toml"), tmp_path / "models/heavy/heavy.toml")
-    heavy = robots.from_model(
-        "heavy",
-        mujoco.MjModel.from_xml_path(str(tmp_path / "models/heavy/heavy.xml")),
-        config.load(Description, source.with_suffix(".toml")),
-    )
-    assert heavy.masses[0] == 23
-    best = policy.load(ROOT / "models/policies/best.npz")
-    policy.save(dataclasses.replace(best, robot=heavy), tmp_path / "heavy.npz")
-    (tmp_path / "walk.csv").write_text(",".join(footsteps.COLUMNS) + "\nleft,0.1\nright,0.2\nleft,0.2\n")
-
-    def run(*arguments: str) -> str:
-        command = [sys.executable, "-m", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert "no fall" in run("bipedtrack.simulate", "heavy.npz", "walk.csv")
-    run("bipedtrack.teleop", "heavy.npz", "--seconds", "0.2", "--port", "0")
-    run("bipedtrack.evaluate", "heavy.npz", "--script", "walk.csv", "--engine", "converged")
-    found = json.loads((tmp_path / "evaluation/metrics.json").read_text())["tasks"]["walk"]["policies"]["heavy.npz"]
-    assert found["converged"]["summary"]["survival"]["falls"] == 0
-
-    (tmp_path / "models/heavy/heavy.xml").write_text("<mujoco>\n<worldbody>\n<body/>\n</mujoco>")
-    with pytest.raises(AssertionError, match="heavy.npz: .*heavy.xml: is no MJCF that MuJoCo compiles: XML") as refusal:
-        run("bipedtrack.simulate", "heavy.npz", "walk.csv")
-    assert "Traceback" not in str(refusal.value)
