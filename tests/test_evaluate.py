@@ -329,7 +329,7 @@ def test_the_table_has_a_line_for_each_policy_and_engine(runs: Runs) -> None:
         (
             runs.script,
             [(name, pathlib.Path(name).stem, engine) for name in (str(FIRST), "silent/best.npz") for engine in ENGINES[1:]],
-            "walk",
+            "walk.csv",
         ),
     ]
     for run, rows, task in expected:
@@ -435,7 +435,7 @@ def test_errors_of_the_traces_are_those_of_the_summary(runs: Runs, mj_model: muj
     groups = [(runs.first, str(FIRST), "walk-forward", "0-best", engine, (0, 1)) for engine in ENGINES[:2]]
     groups += [(runs.zero, "zero", "walk-forward", "0-zero", engine, (0, 1)) for engine in ENGINES[:2]]
     named = ((str(FIRST), "0-best"), ("silent/best.npz", "1-best"))
-    groups += [(runs.script, name, "walk", stem, "mujoco", (0,)) for name, stem in named]
+    groups += [(runs.script, name, "walk.csv", stem, "mujoco", (0,)) for name, stem in named]
     left = {run.out.name: set(run.traces) for run in runs}
     for run, name, task, stem, engine, episodes in groups:
         pooled = []
@@ -492,6 +492,6 @@ def test_zero_keeps_its_joint_targets_in_both_engines(runs: Runs) -> None:
 
 
 def test_policies_of_the_same_file_name_keep_their_own_traces(runs: Runs) -> None:
-    one, other = (runs.script.traces[f"{stem}-mujoco-walk-0"] for stem in ("0-best", "1-best"))
+    one, other = (runs.script.traces[f"{stem}-mujoco-walk.csv-0"] for stem in ("0-best", "1-best"))
     assert np.abs(one["feedback"]).max() > 0.05 and (other["feedback"] == 0).all()
     assert np.abs(one["qpos"] - other["qpos"])[:100].max() > 1e-3
