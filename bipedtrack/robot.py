@@ -21,6 +21,8 @@ from bipedtrack.messages import Refusal
 
 LEGS = ("left", "right")
 JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")  # of a leg, from hip to foot
+AXES = {"hip_yaw": (0, 0, 1), "hip_roll": (1, 0, 0), "hip_pitch": (0, 1, 0)}  # of the joints, in F_B of a standing robot
+AXES |= {"knee": (0, 1, 0), "ankle_pitch": (0, 1, 0), "ankle_roll": (1, 0, 0)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +104,7 @@ def load(name: str = "ranger_max") -> Robot:
 
 
 def from_model(name: str, model: Any, description: Description) -> Robot:
-    """The constants read from a compiled MuJoCo model. Raises RobotError where names or the order do not fit."""
+    """The constants read from a compiled MuJoCo model. Raises RobotError where it is no robot of two such legs."""
     joint_names = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
     actuated = tuple(model.joint(int(i)).name for i in model.actuator_trnid[:, 0])
     ordered = tuple(model.joint(i).name for i in range(1, model.njnt))
@@ -120,6 +122,8 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         return [model.body(int(model.joint(f"{leg}_{joint}").bodyid[0])) for joint in ("hip_yaw", "knee", "ankle_pitch")]
 
     left, right = map(links, LEGS)
+    _check_joints(name, model, joints)
+    _check_legs(name, model, left, right)
     thigh, shank = float(-left[1].pos[2]), float(-left[2].pos[2])
     if description.leg_length[1] > thigh + shank:
         raise RobotError(f"{name}: leg_length {list(description.leg_length)}: a leg is {thigh + shank:g} m long at most")
@@ -146,6 +150,36 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
         centres=np.array([-link.ipos[2] for link in left]),
         timestep=float(model.opt.timestep),
     )
+
+
+def _check_joints(name: str, model: Any, joints: list[Any]) -> None:
+    """Raises RobotError where a joint is not one of a leg, or has no limits, no gains or no limit of its torque."""
+    for i, joint in enumerate(joints):
+        axis = AXES[joint.name.removeprefix(f"{LEGS[0]}_").removeprefix(f"{LEGS[1]}_")]
+        if not (np.allclose(joint.axis, axis) and np.allclose(joint.pos, 0)):
+            raise RobotError(f"{name}: {joint.name} must turn about {list(axis)} at its body's origin")
+        if not joint.range[0] < joint.range[1]:
+            raise RobotError(f"{name}: {joint.name} has no range")
+        kp, kd = model.actuator_gainprm[i, 0], -model.actuator_biasprm[i, 2]
+        if model.actuator_biasprm[i, 1] != -kp or not (kp > 0 and kd > 0 and model.actuator_forcerange[i, 1] > 0):
+            raise RobotError(f"{name}: the actuator of {joint.name} must be a position servo with kp, kv and forcerange")
+
+
+def _check_legs(name: str, model: Any, left: list[Any], right: list[Any]) -> None:
+    """Raises RobotError where thigh, shank and foot are not straight below one another, or the legs are not alike."""
+    trunk = model.body("trunk").id
+    for leg, links in zip(LEGS, (left, right), strict=True):
+        for link, parent, what in zip(links, (trunk, links[0].id, links[1].id), ("thigh", "shank", "foot"), strict=True):
+            if link.parentid[0] != parent or not np.allclose(link.quat, [1, 0, 0, 0]):
+                raise RobotError(f"{name}: the {leg} {what} must hang, without a turn, on the link above it")
+            if what != "thigh" and not (np.allclose(link.pos[:2], 0) and link.pos[2] < 0):
+                raise RobotError(
+                    f"{name}: the {leg} {what} must be straight below the joint above it, not at {list(link.pos)}"
+                )
+    for one, other, what in zip(left, right, ("thighs", "shanks", "feet"), strict=True):
+        alike = (one.pos[[0, 2]], one.mass, one.ipos[[0, 2]]), (other.pos[[0, 2]], other.mass, other.ipos[[0, 2]])
+        if not all(map(np.allclose, *alike)):
+            raise RobotError(f"{name}: both {what} must hang and weigh the same")
 
 
 def build_model(name: str, boxes: Sequence[Sequence[float]] = (), converged: bool = False, touch: bool = False) -> Any:

@@ -322,6 +322,35 @@ def a_shank_is_short(spec: mujoco.MjSpec) -> None:
         spec.body(f"{leg}_foot").pos = [0, 0, -0.3]
 
 
+def a_knee_bends_backwards(spec: mujoco.MjSpec) -> None:
+    spec.joint("left_knee").axis = [0, -1, 0]
+
+
+def a_knee_has_no_range(spec: mujoco.MjSpec) -> None:
+    spec.joint("right_knee").limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    spec.joint("right_knee").range = [0, 0]
+    spec.actuator("right_knee").ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    spec.actuator("right_knee").inheritrange = 0
+
+
+def a_knee_is_driven_by_a_motor(spec: mujoco.MjSpec) -> None:
+    spec.actuator("left_knee").set_to_motor()
+
+
+def a_knee_has_any_torque(spec: mujoco.MjSpec) -> None:
+    spec.actuator("left_knee").forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    spec.actuator("left_knee").forcerange = [0, 0]
+
+
+def a_shank_stands_forward(spec: mujoco.MjSpec) -> None:
+    spec.joint("left_knee").parent.pos = [0.03, 0, -0.4]
+
+
+def a_thigh_is_heavy(spec: mujoco.MjSpec) -> None:
+    for geom in spec.joint("right_hip_pitch").parent.geoms:
+        geom.mass *= 1.5
+
+
 def the_soles_are_missing(spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
         geom.name = geom.name.replace("sole", "base")
@@ -336,6 +365,12 @@ def the_soles_are_missing(spec: mujoco.MjSpec) -> None:
         (a_foot_has_another_name, "no body is named right_foot"),
         (a_shank_is_short, r"leg_length \[0.35, 0.74\]: a leg is 0.7 m long at most"),
         (the_soles_are_missing, "no geom is named left_sole"),
+        (a_knee_bends_backwards, r"left_knee must turn about \[0, 1, 0\] at its body's origin"),
+        (a_knee_has_no_range, "right_knee has no range"),
+        (a_knee_is_driven_by_a_motor, "the actuator of left_knee must be a position servo"),
+        (a_knee_has_any_torque, "the actuator of left_knee must be a position servo"),
+        (a_shank_stands_forward, "the left shank must be straight below the joint above it"),
+        (a_thigh_is_heavy, "both thighs must hang and weigh the same"),
     ],
 )
 def test_a_model_that_does_not_fit_is_refused(change: Callable[[mujoco.MjSpec], None], message: str) -> None:
