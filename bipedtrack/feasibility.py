@@ -14,6 +14,7 @@ from bipedtrack.robot import LEGS, Robot
 from bipedtrack.terrain import TOLERANCE, Box, ground, overlap, rectangle, standing_feet
 
 _ON_THE_WAY = np.arange(1, 8) / 8  # shares of a step's period at which its targets must be within reach
+_SWUNG = np.arange(1, 24) / 24  # shares at which a foot must be clear of boxes
 Boxes = Mapping[int, Box]  # by the lines that name them
 
 
@@ -62,6 +63,29 @@ def _air_problems(robot: Robot, boxes: Boxes, nodes: Nodes, foot: int) -> list[s
     if z > top + TOLERANCE:
         return []
     return [f"the {LEGS[foot]} foot is not up, z = {z:g} m over ground at {top:g} m; wanted it higher, or without `up`"]
+
+
+def swing_problems(robot: Robot, boxes: Boxes, step: TaskStep) -> list[str]:
+    """The boxes that a foot would pass through on its Bezier curve; those that it begins or ends in are told elsewhere."""
+    problems = []
+    for foot in _swinging(step) if boxes else []:
+        known = {line for place in (step.start, step.end) for line in boxes_around(robot, boxes, place, foot)}
+        deepest: dict[int, tuple[float, float]] = {}  # by line: how far under the top, and when
+        for share in _SWUNG:
+            along, _ = planner.eased(share, step.ease)
+            ankles, _ = planner.bezier(step.ankle_points, along)
+            yaws = step.start.ankle_yaws + share * (step.end.ankle_yaws - step.start.ankle_yaws)
+            on_the_way = step.end._replace(ankle_positions=ankles, ankle_yaws=yaws)
+            for line in boxes_around(robot, boxes, on_the_way, foot):
+                depth = boxes[line].top - (ankles[foot, 2] - robot.ankle_height)
+                deepest[line] = max(deepest.get(line, (0.0, 0.0)), (depth, share * step.period))
+        problems += [
+            f"the {LEGS[foot]} foot passes through the box of line {line}, {_cm(depth)} under its top {time:.2f} s into the "
+            "step; wanted a higher lift, or a way around it"
+            for line, (depth, time) in deepest.items()
+            if line not in known
+        ]
+    return problems
 
 
 def support_problems(robot: Robot, boxes: Boxes, step: TaskStep) -> list[str]:

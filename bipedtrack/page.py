@@ -359,9 +359,10 @@ class Page:
     def _place_trunk(self) -> None:
         view = self.clock.view
         within, note = steering.lean(self._robot, view.boxes, view.step.end, self._wanted_trunk(view))
-        self._steer(**{name: value for name, value in within._asdict().items() if name.startswith("trunk")})
+        if within is not None:
+            self._steer(**{name: value for name, value in within._asdict().items() if name.startswith("trunk")})
         if note:
-            self._say(note)
+            self._say(note, wrong=within is None)
 
     # What is shown
 

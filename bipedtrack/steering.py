@@ -107,8 +107,10 @@ def following(robot: Robot, boxes: Sequence[Box], start: Nodes, wishes: Wishes) 
         return walk(robot, boxes, start, wishes.foot, asked), wishes._replace(walking=False)
     if wishes.trunk:
         within, note = lean(robot, boxes, start, asked)
-        moved = trunk_step(robot, start, within)
         wishes = wishes._replace(trunk=False)
+        if within is None:
+            return Planned(hold(robot, start), note), wishes
+        moved = trunk_step(robot, start, within)
         if not same_trunk(start, moved.end):
             return Planned(moved, note), wishes._replace(steering=within)
     return Planned(hold(robot, start)), wishes
@@ -217,8 +219,11 @@ def problems(robot: Robot, boxes: Sequence[Box], start: Nodes, wanted: Foothold,
     return found + footsteps.problems_of(robot, boxes, step_to(robot, boxes, start, wanted, asked))
 
 
-def lean(robot: Robot, boxes: Sequence[Box], start: Nodes, asked: Steering) -> tuple[Steering, str]:
-    """The wishes with the trunk within reach of both feet, and a note where it had to be brought nearer to its default."""
+def lean(robot: Robot, boxes: Sequence[Box], start: Nodes, asked: Steering) -> tuple[Steering | None, str]:
+    """The wishes with the trunk within reach of both feet, and a note where it had to be brought nearer to its default.
+
+    None where the default is out of reach, too.
+    """
     within = clamped(asked)
     names = [name for name in Steering._fields if name.startswith("trunk")]
     wanted, home = (np.array([getattr(wish, name) for name in names]) for wish in (within, Steering()))
@@ -233,6 +238,8 @@ def lean(robot: Robot, boxes: Sequence[Box], start: Nodes, asked: Steering) -> t
     if not found:
         note = "the trunk was kept within what the policy knows" if within != asked else ""
         return within, note
+    if problems(home):
+        return None, f"the trunk stays where it is: {found[0]}"
     share = footholds.share_of_way(lambda trunk: not problems(trunk), wanted, home)
     return wish(home + share * (wanted - home)), f"the trunk was brought back within reach: {found[0]}"
 

@@ -22,6 +22,8 @@ WRONG = {
     "toes in a riser": ("# box 0.3 0 0 0 0.2 0.4 0.1\nleft,0.15", 3, "inside the box of line 2"),
     "a pole under the sole": ("# box 0.2 0.1 0 0 0.02 0.02 0.1\nleft,0.2,0.1,0", 3, "inside the box of line 2"),
     "under a low roof": ("# box 0.3 0.1 0.02 0 0.4 0.1 0.1\nleft,0.3,0.1,0", 3, "inside the box of line 2"),
+    # the foot is at most 8 cm high
+    "through a wall": ("# box 0.2 0.1 0 0 0.04 0.1 0.3\nleft,0.4", 3, "foot passes through the box of line 2, 2"),
     "over the edge when turned": ("# box 0.2 0.1 0 0 0.16 0.1 0.05\nleft,0.2,0.1,,0.3", 3, "in the air: under 4"),
 }  # fmt: skip
 
@@ -49,7 +51,8 @@ def test_what_is_wrong_is_named_with_its_line(rows: str, line: int, words: str) 
         "# box 0.3 0.1 0.5 0 0.4 0.1 0.1\nleft,0.3,0.1,0",  # under a high roof
         "# box 0.15 0.1 0 0 0.1 0.2 0.05\n# box 0.25 0.1 0 0 0.1 0.2 0.05\nleft,0.2",  # over a joint of two boxes
         "# box 0.2 0.1 -0.2 0 0.4 0.1 0.1\nleft,0.2,0.1",  # buried
-        "left,,,,,0.005\nboth\nleft,,,,,,0",
+        "left,,,,,0.1\nboth\nleft,,,,,,0",
+        "# box 0.2 0.1 0 0 0.04 0.1 0.07\nleft,0.4",  # over a bar,
     ],
 )
 def test_what_is_only_just_right_passes(rows: str) -> None:
