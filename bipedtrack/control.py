@@ -12,9 +12,23 @@ from bipedtrack.planner import Command
 from bipedtrack.robot import Robot
 from bipedtrack.rotations import Array, namespace
 
+LONGEST_HOLD = 0.08  # s for which a policy may hold a feedback: shorter than any task step (planner.SHORTEST) at any pace
 INTEGRAL_LIMIT = 0.15  # of the integral, in half ranges of the joints: some three times what standing needs
 INTEGRAL_SPEED = 0.3  # rad/s: while any joint is faster the integral waits, and `anchor` measures the feet anew
 INTEGRAL_FADES = 0.2  # s: with this time constant while the command moves
+
+
+def substeps(policy_period: float, timestep: float) -> int:
+    """Control steps of `timestep` s that a feedback is held for `policy_period` s.
+
+    Raises ValueError where that is no whole number, or longer than LONGEST_HOLD.
+    """
+    ratio = policy_period / timestep
+    if not (math.isfinite(ratio) and round(ratio) >= 1 and math.isclose(ratio, round(ratio), rel_tol=1e-6)):
+        raise ValueError(f"policy_period {policy_period:g} s is no multiple of {timestep:g} s")
+    if policy_period > LONGEST_HOLD:
+        raise ValueError(f"policy_period {policy_period:g} s is too long; wanted at most {LONGEST_HOLD:g} s")
+    return round(ratio)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +84,11 @@ def denormalize(robot: Robot, action: Array) -> Array:
     xp = namespace(action)
     middle, half = (xp.asarray(v, dtype=action.dtype) for v in (robot.joint_middle, robot.joint_half_range))
     return middle + half * action
+
+
+def feedback(settings: ControlConfig, output: Array) -> Array:
+    """a_fb (..., 12) in [-1, 1] of the network's output (..., 12), its mean or with noise (eqs 9, 10)."""
+    return namespace(output).clip(settings.feedback_scale * output, -1.0, 1.0)
 
 
 def initial(standing: Array, a_ff: Array | None = None) -> ControlState:

@@ -6,7 +6,6 @@ Written for one robot; training maps it over thousands. `TrackingEnv.step` is th
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -114,9 +113,7 @@ class TrackingEnv(brax.envs.Env):
         self.config = config
         self.given = given
         self.source = source
-        self.substeps = round(config.policy_period / the_robot.timestep)
-        if self.substeps < 1 or not math.isclose(self.substeps * the_robot.timestep, config.policy_period, rel_tol=1e-6):
-            raise ValueError(f"policy_period {config.policy_period} s is no multiple of {the_robot.timestep} s")
+        self.substeps = control.substeps(config.policy_period, the_robot.timestep)
         if boxes is None:
             boxes = [terrain.STAIR_BOX] * terrain.STAIR_BOXES if config.stairs else []
         self.mj_model = robot.build_model(the_robot.name, boxes, touch=touch)
@@ -183,7 +180,7 @@ class TrackingEnv(brax.envs.Env):
     def step(self, state: brax.envs.State, action: Array) -> brax.envs.State:
         """One policy step: the feedback is held while planner, feedforward, filter and PD run at 200 Hz."""
         before, episode = state.pipeline_state, state.info["episode"]
-        a_fb = jnp.clip(self.config.control.feedback_scale * action, -1.0, 1.0)
+        a_fb = control.feedback(self.config.control, action)
         episode, following = self.look_ahead(self._pushed(episode))
         advance = lambda carry, _: self.control_step(carry[0], carry[1], following, a_fb)  # noqa: E731
         (physics, episode), answer = jax.lax.scan(advance, (before, episode), length=self.substeps)
@@ -203,12 +200,12 @@ class TrackingEnv(brax.envs.Env):
             jnp.where(finite, answer.qacc[-1, 6:], 0.0),
         )
         episode = episode._replace(feedback=a_fb)
-        fell = falls.fell(command.target, measured)
+        fell = falls.fell(command.target, measured) | ~finite
         return state.replace(
             pipeline_state=physics,
             obs=self.observe(physics, episode, command),
             reward=rewards.total(self.config.rewards.weights, terms),
-            done=(fell | ~finite).astype(jnp.float32),
+            done=fell.astype(jnp.float32),
             metrics={
                 **terms._asdict(),
                 **tasks.tracking_errors(errors),

@@ -13,7 +13,7 @@ defaults. What the cells mean and what empty ones do:
     x, y, yaw                of the point under the ankle when the foot is flat; empty: where the foot stands;
                              of a jump, of the point midway between the feet
     z                        of the same point; empty: the top of the highest box at (x, y), else 0
-    period                   empty: 0.55 s; rounded to a multiple of the control period
+    period                   at least 0.1 s; empty: 0.55 s; rounded to a multiple of the control period
     lift                     above the higher end of the swing; 0 slides the foot straight; empty: 0.08 m
     trunk_x, trunk_y         at the end of the step; empty: the centre of mass is midway between the feet that stand
     trunk_z                  absolute, as all; empty: 0.75 m above the mean height of the footholds
@@ -105,12 +105,13 @@ def parse(text: str, robot: Robot, name: str, sway: float = SWAY) -> Script:
             place = f"x = 0 m, y = {FEET_Y[foot]:g} m"
             problems[line].append(f"the box stands where the {leg} foot starts, {place}; wanted it elsewhere")
 
-    written = rows.read_rows(lines, robot.timestep, problems)
+    written = rows.read_rows(lines, problems)
     steps, within_reach = [], True
     for row in written:
         step = task_step(robot, boxes.values(), now, row.feet, row.values, sway)
         if boxes_known and _known(step.end):
             problems[row.line] += feasibility.foothold_problems(robot, boxes, step, row.up)
+            problems[row.line] += feasibility.swing_problems(robot, boxes, step) if _known(step.start) else []
             problems[row.line] += feasibility.support_problems(robot, boxes, step)
             if step.end is not step.start:
                 # the way begins out of reach where the line before ended there
@@ -255,7 +256,8 @@ def balanced(robot: Robot, nodes: Nodes, centre: np.ndarray) -> Nodes:
 def problems_of(robot: Robot, boxes: Sequence[Box], step: TaskStep) -> list[str]:
     """What keeps the robot from making a task step, one sentence each; boxes count as lines from 1."""
     by_line = dict(enumerate(boxes, 1))
-    return feasibility.foothold_problems(robot, by_line, step) + feasibility.reach_problems(robot, step, on_the_way=True)
+    found = feasibility.foothold_problems(robot, by_line, step) + feasibility.swing_problems(robot, by_line, step)
+    return found + feasibility.reach_problems(robot, step, on_the_way=True)
 
 
 def _known(nodes: Nodes) -> bool:

@@ -28,6 +28,9 @@ _LONG_AGO = 60.0  # time constants: nothing of a pendulum's start is left
 _SAMPLES = 33  # points of a curve that are held against edges
 
 
+SHORTEST = 0.1  # s, of a task step: policies answer sooner (control.LONGEST_HOLD), and MJX looks ahead to one step
+
+
 class TaskStep(NamedTuple):
     """One foot's movement from leaving the ground to returning to it, or a movement of the trunk alone."""
 

@@ -78,8 +78,7 @@ class Policy:
 
     def feedback(self, flat_observation: Array) -> Array:
         """a_fb (..., 12) in [-1, 1] for observations (..., 101), without exploration noise."""
-        output = self.output(flat_observation)
-        return namespace(output).clip(self.settings.feedback_scale * output, -1.0, 1.0)
+        return control.feedback(self.settings, self.output(flat_observation))
 
 
 def save(policy: Policy, path: str | pathlib.Path) -> None:
@@ -215,9 +214,10 @@ def _check(policy: Policy) -> None:
             raise PolicyError(f"the robot's {name} must be a positive number, not {value!r}")
     if not (robot.joint_low < robot.joint_high).all():
         raise PolicyError("the robot's joint_low must lie below joint_high")
-    ticks = policy.policy_period / robot.timestep
-    if not (math.isfinite(ticks) and round(ticks) >= 1 and math.isclose(ticks, round(ticks), rel_tol=1e-6)):
-        raise PolicyError(f"policy_period {policy.policy_period} s is no multiple of {robot.timestep} s")
+    try:
+        control.substeps(policy.policy_period, robot.timestep)
+    except ValueError as error:
+        raise PolicyError(str(error)) from None
 
 
 def _check_robot(trained: Robot, wanted: Robot) -> None:
@@ -237,6 +237,11 @@ def _as_float32(tree: Any) -> Any:
     return np.asarray(tree, np.float32)
 
 
+def _is_finite(tree: Any) -> bool:
+    """Whether all numbers of a struct of structs are finite."""
+    return all(map(_is_finite, tree)) if isinstance(tree, tuple) else bool(np.isfinite(tree).all())
+
+
 class Controller:
     """The whole controller in numpy: measured state and command in, joint targets out, every 0.005 s.
 
@@ -252,7 +257,7 @@ class Controller:
         self.policy = policy
         self.robot = policy.robot.cast(np.float32)
         self.uses_feedback = feedback
-        self._hold = max(1, round(policy.policy_period / policy.robot.timestep))
+        self._hold = control.substeps(policy.policy_period, policy.robot.timestep)
         self._tick = 0
         self._feedback = np.zeros(len(policy.robot.joint_names), np.float32)
         self._standing: np.ndarray | None = None  # normalised joint angles at reset
@@ -273,6 +278,8 @@ class Controller:
         joints = np.asarray(qpos, np.float32)[7:]
         if joints.shape != self._feedback.shape:
             raise ValueError(f"qpos must have {7 + self._feedback.size} numbers, not {np.size(qpos)}")
+        if not np.isfinite(joints).all():
+            raise ValueError(f"qpos is not finite: {np.asarray(qpos)}")
         self._standing = control.normalize(self.robot, joints)
         self._memory = None
         self._feedback = np.zeros_like(self._feedback)
@@ -288,7 +295,7 @@ class Controller:
 
         Raises:
           RuntimeError: before `reset`.
-          ValueError: a state of another size or that is not finite; the controller's memory is then as before.
+          ValueError: a state of another size, or a state or command that is not finite; the memory is then as before.
         """
         if self._standing is None:
             raise RuntimeError("call reset(qpos) before the first step")
@@ -298,6 +305,8 @@ class Controller:
             if not np.isfinite(state).all():
                 raise ValueError(f"{name} is not finite: {np.asarray(state)}")
         command = _as_float32(command)
+        if not _is_finite(command):
+            raise ValueError(f"the command is not finite: {command}")
         a_ff = control.feedforward(self.robot, self.policy.settings, command.target)
         if self._memory is None:
             self._memory = control.initial(self._standing, a_ff)

@@ -49,11 +49,10 @@ def mjx_recorder(the_env: env.TrackingEnv, act: Act) -> Callable[[plans.Plan, fl
 
     `the_env` needs plans.PLANNED as its source, the batches' boxes, and touch sensors.
     """
-    scale = the_env.config.control.feedback_scale
 
     def policy_step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], _Sample]:
         state, alive = carry
-        a_fb = jnp.clip(scale * act(state.obs), -1.0, 1.0)
+        a_fb = control.feedback(the_env.config.control, act(state.obs))
         episode, following = the_env.look_ahead(state.info["episode"])
 
         def control_step(carry: Any, _: None) -> tuple[Any, _Sample]:
@@ -129,7 +128,7 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
     import mujoco
 
     the_robot = controls.robot
-    hold = max(1, round(controls.policy_period / the_robot.timestep))
+    hold = control.substeps(controls.policy_period, the_robot.timestep)
 
     @jax.jit
     @jax.vmap
@@ -139,7 +138,7 @@ def mujoco_recorder(controls: Controls) -> Callable[..., Trace]:
         a_ff = control.feedforward(the_robot, controls.settings, wanted)
         real = kinematics.measure(the_robot, qpos)
         seen = observation.flatten(observation.observe(command, real, qpos, qvel, a_ff, memory.feedback))
-        fresh = jnp.clip(controls.settings.feedback_scale * controls.act(seen), -1.0, 1.0)
+        fresh = control.feedback(controls.settings, controls.act(seen))
         a_fb = jnp.where(think, fresh, memory.feedback)
         targets, state = control.respond(the_robot, controls.settings, memory.control, a_ff, a_fb, command, qpos, qvel)
         return targets, _Memory(state, a_fb), command.target, command.timer, stationary(command.rates)

@@ -11,6 +11,7 @@ import reprlib
 from collections import Counter, defaultdict
 from typing import NamedTuple
 
+from bipedtrack.planner import SHORTEST
 from bipedtrack.robot import LEGS
 from bipedtrack.terrain import TOLERANCE, Box
 
@@ -63,7 +64,7 @@ def read_boxes(lines: dict[int, str], problems: Problems) -> dict[int, Box]:
     return boxes
 
 
-def read_rows(lines: dict[int, str], timestep: float, problems: Problems) -> list[Row]:
+def read_rows(lines: dict[int, str], problems: Problems) -> list[Row]:
     """The task steps as written."""
     table = {}
     for line, text in lines.items():
@@ -85,7 +86,7 @@ def read_rows(lines: dict[int, str], timestep: float, problems: Problems) -> lis
         return []
     if not table:
         problems[header_line].append("no step follows the header; wanted a line for each step")
-    return [_read_row(line, header, cells, timestep, problems[line]) for line, cells in table.items()]
+    return [_read_row(line, header, cells, problems[line]) for line, cells in table.items()]
 
 
 def _header_problems(header: list[str]) -> list[str]:
@@ -106,7 +107,7 @@ def _header_problems(header: list[str]) -> list[str]:
     return problems
 
 
-def _read_row(line: int, header: list[str], cells: list[str], timestep: float, problems: list[str]) -> Row:
+def _read_row(line: int, header: list[str], cells: list[str], problems: list[str]) -> Row:
     """One task step as written, with every cell held to its own bounds."""
     if len(cells) > len(header):
         problems.append(f"has {len(cells)} cells; wanted at most {len(header)}, one for each column")
@@ -128,7 +129,7 @@ def _read_row(line: int, header: list[str], cells: list[str], timestep: float, p
     else:
         problems.append(f"foot is {reprlib.repr(foot)}; wanted left, right, left up, right up, jump or both")
         feet, values["x"] = (0, 1), math.nan
-    for column, least in (("period", timestep), ("lift", 0.0)):
+    for column, least in (("period", SHORTEST), ("lift", 0.0)):
         value = values.get(column, least)
         if value < least:
             unit = UNITS[column]

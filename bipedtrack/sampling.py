@@ -1,16 +1,16 @@
 """Table II as ranges, and what episodes are drawn from at a difficulty.
 
-All that lessons change (ranges, shares, hold) is data in a `Distribution`, so one compiled program serves every lesson.
-Random numbers are jax's; the namespace is jax.numpy.
+All that difficulty changes (ranges, shares, hold) is data in a `Distribution`, so one compiled program serves all parts of
+a lesson and all kinds of an evaluation.
+Random numbers are jax's; the namespace is jax.numpy. It is imported inside the functions, so that ranges can be read, and
+a missing jax be named, without it.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
+from bipedtrack.planner import SHORTEST
 from bipedtrack.rotations import Array
 
 KINDS = ("stand", "squat", "walk", "sidle", "turn", "wander", "stairs")
@@ -70,8 +70,8 @@ class Ranges(NamedTuple):
         for name, (low, mild, high) in self._asdict().items():
             if not low <= mild <= high:
                 raise ValueError(f"{name} must be [lowest, mildest, highest], not {[low, mild, high]}")
-        if self.period[0] <= 0 or self.squat_period[0] <= 0:
-            raise ValueError("periods must be positive")
+        if min(self.period[0], self.squat_period[0]) < SHORTEST:
+            raise ValueError(f"periods must be at least {SHORTEST:g} s")
         if not 0 <= self.swing_ease[0] <= self.swing_ease[2] < 0.5:
             raise ValueError(f"swing_ease must lie in [0, 0.5), not {list(self.swing_ease)}")
 
@@ -118,6 +118,8 @@ def distribution(
     break_share: float = 0.0,
 ) -> Distribution:
     """The distribution at a difficulty in [0, 1]: ranges shrink linearly from full to their mildest value."""
+    import jax.numpy as jnp
+
     ordered = [getattr(shares, kind) for kind in KINDS]
     total = jnp.array(ordered, jnp.float32)
     last = max(i for i, share in enumerate(ordered) if share > 0)  # rounding must not leave room behind it
@@ -139,6 +141,8 @@ def distribution(
 
 def sample(key: Array, names: tuple[str, ...], ranges: dict[str, Array]) -> dict[str, Array]:
     """One uniform number per name, within its range."""
+    import jax
+
     u = jax.random.uniform(key, (len(names),))
     return {name: within(u[i], ranges[name]) for i, name in enumerate(names)}
 

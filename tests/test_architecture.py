@@ -102,3 +102,13 @@ def test_a_module_that_needs_jax_does_not_import_without_it() -> None:
     done = run("import sys; sys.modules['jax'] = None; import bipedtrack.tasks")
     assert done.returncode == 1
     assert "jax" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("module", ["train", "evaluate", "export", "simulate"])
+def test_a_command_names_a_missing_jax_in_one_line(module: str) -> None:
+    """Nobody gets as far as jax's own import before the versions are looked at."""
+    done = run(
+        "import sys; sys.modules.update(dict.fromkeys(('jax', 'brax', 'flax', 'optax')))\n"
+        f"from bipedtrack import versions, {module}; print(versions.VersionError.__name__)"
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "VersionError"), done.stderr

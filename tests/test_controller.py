@@ -221,6 +221,30 @@ def test_a_step_with_states_of_another_size_raises(original, commands, qpos, qve
         controller.step(np.resize(STAND, qpos), np.resize(STILL, qvel), commands[0])
 
 
+def test_a_reset_that_is_not_finite_raises(original):
+    with pytest.raises(ValueError, match="qpos is not finite"):
+        Controller(original).reset(np.where(np.arange(19) == 9, np.nan, STAND))
+
+
+def test_what_is_not_finite_raises_and_is_forgotten(original, commands):
+    """A state or a command with a nan; afterwards the controller goes on as if it had not been asked."""
+    disturbed, alone = Controller(original), Controller(original)
+    for controller in (disturbed, alone):
+        controller.reset(STAND)
+        controller.step(STAND, STILL, commands[0])
+    bad = np.array([np.nan, 0.0, 0.7])
+    target = commands[1].target._replace(trunk_position=bad)
+    for qpos, qvel, command, named in (
+        (np.where(np.arange(19) == 9, np.nan, STAND), STILL, commands[1], "qpos"),
+        (STAND, np.where(np.arange(18) == 9, np.inf, STILL), commands[1], "qvel"),
+        (STAND, STILL, commands[1]._replace(target=target), "command"),
+    ):
+        with pytest.raises(ValueError, match=f"{named} is not finite"):
+            disturbed.step(qpos, qvel, command)
+    for command in commands[1:5]:
+        np.testing.assert_array_equal(disturbed.step(STAND, STILL, command), alone.step(STAND, STILL, command))
+
+
 def test_reset_makes_a_run_reproducible(original, commands):
     controller = Controller(original)
     controller.reset(STAND)
