@@ -25,15 +25,18 @@ def use_cache() -> pathlib.Path | None:
 
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
-    root = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-    folder = root / "bipedtrack" / f"programs-{_machine()}"
     try:
+        root = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+        folder = root / "bipedtrack" / f"programs-{_machine()}"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         state = folder.stat()
         if state.st_uid != os.getuid():
             return None
         folder.chmod(0o700)
-    except OSError:  # no home, or a full or read-only disk: everything works without, only slower
+    except (
+        OSError,
+        RuntimeError,
+    ):  # a full or read-only disk, or a user without a home: everything works without, only slower
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST)

@@ -88,8 +88,8 @@ class Lesson:
     noise: float | None = None  # standard deviation that exploration begins the lesson with; else it goes on as it was
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.parts < 1:
-            raise ValueError("steps and parts must be at least 1")
+        if not 1 <= self.parts <= self.steps:
+            raise ValueError("steps and parts must be at least 1, and every part needs a step")
         if not 0 <= self.difficulty <= 1:
             raise ValueError(f"difficulty must lie in [0, 1], not {self.difficulty}")
         if not 0 <= self.push_share <= 1:
@@ -177,13 +177,6 @@ class Curriculum:
         """Policy steps until the time limit."""
         return round(self.episode_seconds / self.policy_period)
 
-    def substeps(self, timestep: float) -> int:
-        """Control steps of `timestep` s that a feedback is held. Raises ConfigError where that is no whole number."""
-        ratio = self.policy_period / timestep
-        if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
-            raise config.ConfigError(f"policy_period {self.policy_period} s is no multiple of {timestep} s")
-        return round(ratio)
-
 
 @dataclasses.dataclass(frozen=True)
 class Call:
@@ -267,13 +260,17 @@ def load(name_or_path: str) -> Curriculum:
 
 
 def _inherited(data: dict[str, Any]) -> dict[str, Any]:
-    """A curriculum's tables with each stage's `control`, `rewards` and `ranges` over the curriculum's own."""
+    """A curriculum's tables with each stage's `control`, `rewards` and `ranges` over the curriculum's own.
+
+    The weights of rewards have no defaults of their own, for terms have none: those of RewardConfig are filled in.
+    """
     stages = data.get("stages")
     if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
         return data  # config says what is wrong with it
-    common = {name: data[name] for name in ("control", "rewards", "ranges") if name in data}
+    common: dict[str, Any] = {name: data[name] for name in ("control", "ranges") if name in data}
+    common["rewards"] = _over(config.to_dict(RewardConfig()), data.get("rewards", {}))
     own = [{name: _over(common[name], stage[name]) for name in common if name in stage} for stage in stages]
-    return data | {"stages": [stage | tables for stage, tables in zip(stages, own, strict=True)]}
+    return data | common | {"stages": [stage | tables for stage, tables in zip(stages, own, strict=True)]}
 
 
 def _over(common: Any, own: Any) -> Any:

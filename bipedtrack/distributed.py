@@ -56,9 +56,9 @@ def join(coordinator: str, processes: int, process: int, detect: bool) -> Proces
 
     Raises DistributedError where the arguments do not fit or the others do not come.
     """
+    if not coordinator and (processes != 1 or process != 0):
+        raise DistributedError("--processes and --process need --coordinator HOST:PORT, where the first process listens")
     if not coordinator and not detect:
-        if processes != 1 or process != 0:
-            raise DistributedError("--processes and --process need --coordinator HOST:PORT, where the first process listens")
         return ALONE
     if coordinator and detect:
         raise DistributedError("--distributed finds the coordinator in the environment; give it or --coordinator, not both")

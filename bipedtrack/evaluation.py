@@ -77,9 +77,11 @@ def _only(
     return sampling.distribution(config.ranges, chosen, difficulty, hold_share, hold_after)
 
 
-def level_ground(rows: list[Row]) -> Row:
-    """The mean over the kinds on level ground, each kind counting the same."""
+def level_ground(rows: list[Row]) -> Row | None:
+    """The mean over the kinds on level ground, each counting the same; None where there is none."""
     flat = [row for row in rows if row.kind not in ("stairs", HOLD)]
+    if not flat:
+        return None
     names = [field.name for field in dataclasses.fields(Row)][2:]
     means = {name: float(np.mean([getattr(row, name) for row in flat])) for name in names}
     return Row("level ground", sum(row.episodes for row in flat), **means)

@@ -9,6 +9,7 @@ from types import TracebackType
 import rich.console
 import rich.live
 import rich.table
+import rich.text
 import tensorboardX
 
 from bipedtrack import checkpoint
@@ -49,7 +50,7 @@ class Progress:
 
     def say(self, text: str) -> None:
         """Prints a line beside the live display."""
-        self._console.print(text, highlight=False, soft_wrap=True)
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def compiling(self, call: Call, what: str) -> None:
         """Announces that a call's program is being compiled, which takes a while and shows nothing else."""
@@ -96,7 +97,7 @@ class Progress:
         if self._console.is_terminal:
             table = rich.table.Table.grid(padding=(0, 2))
             for name, text in shown.items():
-                table.add_row(f"[bold]{name}", text)
+                table.add_row(rich.text.Text(name, "bold"), rich.text.Text(text))
             self._live.update(table, refresh=True)
         elif doing != "training" or time.monotonic() - self._spoke > _LINE_EVERY:
             self._spoke = time.monotonic()

@@ -64,6 +64,13 @@ class RewardConfig(NamedTuple):
     weights: Terms = WEIGHTS
     sharpness: Sharpness = Sharpness()
 
+    def validate(self) -> None:
+        """Raises ValueError where a number is negative: errors would be rewarded."""
+        for table, numbers in self._asdict().items():
+            for name, value in numbers._asdict().items():
+                if value < 0:
+                    raise ValueError(f"{table}.{name} must not be negative, not {value:g}")
+
 
 def norm(x: Array) -> Array:
     """Euclidean length along the last axis."""

@@ -55,12 +55,15 @@ class RunDirectory:
         try:
             if run._settings_file.exists():
                 raise RunError(f"{path}: already holds a run; go on with --resume or use another directory")
-            if run._indices():
+            if run._indices() or run._start.exists():
                 raise RunError(f"{path}: holds checkpoints without their run.json; use another directory")
-            run._start.unlink(missing_ok=True)  # of a run that could not be created
-            if start is not None:
-                save_arrays(run._start, start.arrays, {"index": -1, "meta": start.meta}, "checkpoint")
-            write_json(run._settings_file, settings)
+            try:
+                if start is not None:
+                    save_arrays(run._start, start.arrays, {"index": -1, "meta": start.meta}, "checkpoint")
+                write_json(run._settings_file, settings)
+            except BaseException:
+                run._start.unlink(missing_ok=True)
+                raise
         except BaseException:
             run.close()
             raise

@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import pathlib
+import shlex
 import signal
 import sys
 import traceback
@@ -15,7 +16,7 @@ from typing import Any, Literal, NoReturn
 
 import tyro
 
-from bipedtrack import checkpoint, compilation, config, curriculum, distributed, robot, symmetry, versions
+from bipedtrack import checkpoint, compilation, config, control, curriculum, distributed, robot, symmetry, versions
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.messages import Refusal, fail, quiet_imports
@@ -191,15 +192,24 @@ def _job(options: Train) -> Job:
             raise config.ConfigError("--resume goes on from the run's own checkpoints; leave out --start")
         with contextlib.closing(RunDirectory.open(_folder(options))) as directory:
             plan, seed, devices = curriculum.of_run(directory)
+        _check(plan)
         return Job(config.to_dict(plan), seed, options.devices or devices)
     plan = curriculum.load(options.curriculum)
+    _check(plan)
+    return Job(config.to_dict(plan), options.seed, options.devices)
+
+
+def _check(plan: Curriculum) -> None:
+    """Raises ConfigError where the robot or the scripts do not fit the curriculum, rather than in its last hour."""
     the_robot = robot.load(plan.robot)
-    plan.substeps(the_robot.timestep)
+    try:
+        control.substeps(plan.policy_period, the_robot.timestep)
+    except ValueError as error:
+        raise config.ConfigError(str(error)) from None
     if plan.network.symmetric and not symmetry.is_symmetric(the_robot):
         raise config.ConfigError(f"network.symmetric: robot {plan.robot!r} is not its own mirror image; wanted false")
-    for stage in plan.stages:  # rather than in the last hour
+    for stage in plan.stages:
         curriculum.scripts_of(plan, stage, the_robot)
-    return Job(config.to_dict(plan), options.seed, options.devices)
 
 
 def _folder(options: Train) -> pathlib.Path:
@@ -210,7 +220,7 @@ def _directory(options: Train, job: Job, process: Process) -> RunDirectory:
     """The run directory, created where the run is a new one."""
     if options.resume:
         return RunDirectory.open(_folder(options))
-    settings = dataclasses.asdict(job) | {"processes": process.count, "versions": _versions()}
+    settings = dataclasses.asdict(job) | _circumstances(process)
     start = None if options.start is None else _start(options.start, job.plan)
     return RunDirectory.create(_folder(options), settings, start)
 
@@ -246,8 +256,18 @@ def _train_along(job: Job, process: Process) -> None:
     training.train(job.plan, None, job.seed, job.devices, Aside(), lambda: False, process)
 
 
-def _versions() -> dict[str, str | None]:
-    return {row.name: row.found for row in versions.check()}
+def _circumstances(process: Process) -> dict[str, Any]:
+    """What besides curriculum, seed and devices decides the last bits of a training."""
+    return {"processes": process.count, "versions": {row.name: row.found for row in versions.check()}}
+
+
+def _changes(began: dict[str, Any], job: Job, process: Process) -> list[str]:
+    """What is not as the run began with it, in words; the parameters will be others than without the change."""
+    now = {"devices": job.devices, **_circumstances(process)}
+    found = [(name, began.get(name, now[name]), now[name]) for name in ("devices", "processes")]
+    before = began.get("versions", now["versions"])
+    found += [(name, before.get(name), version) for name, version in now["versions"].items()]
+    return [f"the run began with {name} {old}, and goes on with {new}" for name, old, new in found if old != new]
 
 
 def _train(directory: RunDirectory, job: Job, description: str, process: Process) -> None:
@@ -264,7 +284,7 @@ def _train(directory: RunDirectory, job: Job, description: str, process: Process
     finished = 0 if found is None else found.call + 1
     done = f"{finished} calls are done" if finished else "begins with another run's network"
     with Progress(directory.path, plan, calls, sum(call.steps for call in calls[:finished])) as progress:
-        for warning in directory.warnings:
+        for warning in [*directory.warnings, *_changes(directory.settings, job, process)]:
             progress.say(f"warning: {warning}")
         progress.say(
             f"{plan.name}, seed {seed}, on {description}: {len(plan.stages)} stages, {len(calls)} PPO calls, "
@@ -277,7 +297,7 @@ def _train(directory: RunDirectory, job: Job, description: str, process: Process
             saved = directory.latest()
             progress.say(
                 f"stopped; {0 if saved is None else saved.call + 1} of {len(calls)} calls are saved. Go on with:\n"
-                f"  python -m bipedtrack.train --resume --out {directory.path}"
+                f"  python -m bipedtrack.train --resume --out {shlex.quote(str(directory.path))}"
             )
             sys.exit(130)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -287,13 +307,17 @@ def _train(directory: RunDirectory, job: Job, description: str, process: Process
     console = rich.console.Console()
     if plan.evaluation_episodes:
         _show_table(directory, plan, trained, console)
-    console.print(f"policy: {path}", highlight=False, soft_wrap=True)
+    console.print(f"policy: {path}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _show_table(directory: RunDirectory, plan: curriculum.Curriculum, trained: Any, console: Any) -> None:
-    """Evaluates inverse kinematics alone and the trained policy, prints the table and writes table.json."""
+    """Evaluates inverse kinematics alone and the trained policy, prints the table and writes table.json.
+
+    Both are told to sway as the policy's file says.
+    """
     from bipedtrack import evaluation
 
+    plan = dataclasses.replace(plan, ranges=plan.ranges.swaying(trained.sway))
     difficulty = EVALUATION_DIFFICULTY
     rows: dict[str, list[evaluation.Row]] = {}
     for name, controller in (("IK alone", None), ("trained", trained)):
@@ -302,11 +326,12 @@ def _show_table(directory: RunDirectory, plan: curriculum.Curriculum, trained: A
     console.print(evaluation.comparison(plan, difficulty, rows))
     for name in rows:
         flat = evaluation.level_ground(rows[name])
-        console.print(
-            f"level ground, {name}: {100 * flat.survival:.0f} % without a fall, lasts {flat.seconds:.1f} s, "
-            f"ankles {flat.ankle_error_cm:.1f} cm",
-            highlight=False,
-        )
+        if flat is not None:
+            console.print(
+                f"level ground, {name}: {100 * flat.survival:.0f} % without a fall, lasts {flat.seconds:.1f} s, "
+                f"ankles {flat.ankle_error_cm:.1f} cm",
+                highlight=False,
+            )
     record = {name: [dataclasses.asdict(row) for row in table] for name, table in rows.items()}
     checkpoint.write_json(directory.path / "table.json", {"difficulty": difficulty, "seed": EVALUATION_SEED, **record})
 

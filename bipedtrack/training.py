@@ -1,12 +1,13 @@
 """Stages and lessons as brax PPO calls, one after another; only `ppo_arguments` knows the names of what brax is told.
 
-A call is a pure function of (parameters, call, run's seed), the robot's files and the footstep scripts, which a run names
-and does not keep. A run that was killed repeats its unfinished call and ends in bitwise the same parameters on the same
-machine; what a call costs to repeat is set by the curriculum (`parts`).
+A call is a pure function of (parameters, call, run's seed), the numbers of processes and devices, and of the robot's files
+and the footstep scripts, which a run names and does not keep. A run that was killed repeats its unfinished call and ends in
+bitwise the same parameters on the same machine; what a call costs to repeat is set by the curriculum (`parts`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import pathlib
@@ -37,6 +38,7 @@ from bipedtrack import (
 from bipedtrack.adapted_brax import Term, adapted_brax
 from bipedtrack.checkpoint import Checkpoint, CheckpointError
 from bipedtrack.distributed import ALONE, Process
+from bipedtrack.messages import Refusal
 from bipedtrack.networks import Params
 from bipedtrack.progress import Aside, Progress
 from bipedtrack.run_directory import RunDirectory
@@ -46,6 +48,10 @@ _LOOK_BACK = 1.0  # s before a fall from which, or from up to twice as much befo
 
 class Stopped(Exception):
     """Somebody asked the training to stop; everything up to the last finished call is saved."""
+
+
+class DivergedError(Refusal, RuntimeError):
+    """A call ended with parameters that are not finite; the message is one line."""
 
 
 def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: curriculum.Lesson) -> env.TrackingEnv:
@@ -83,8 +89,8 @@ def train(
     """Runs the calls that are not yet finished, saving after each, and returns the last parameters.
 
     Where several processes train together the first one alone has a run directory, and all begin with its checkpoint.
-    Raises Stopped within a few updates after `wants_to_stop` turned true, RunError when a checkpoint cannot be written, and
-    DistributedError where the processes do not agree.
+    Raises Stopped within a few updates after `wants_to_stop` turned true, RunError when a checkpoint cannot be written,
+    DivergedError where parameters are not finite any more, and DistributedError where the processes do not agree.
     """
     found = run.latest() if run else None
     params = None if found is None else networks.from_arrays(config, found.arrays)
@@ -94,8 +100,16 @@ def train(
         params = distributed.share_arrays(blank if params is None else params, process)
     origin = None if found is None else origin_of(found)
     for call in curriculum.calls(config)[0 if last is None else last + 1 :]:
+        if wants_to_stop():
+            raise Stopped
         params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
         arrays = networks.to_arrays(params)
+        broken = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+        if broken:
+            raise DivergedError(
+                f"stage {call.stage.name!r}, lesson {call.lesson.name!r}: the training diverged, {broken[0]} is not finite; "
+                "what was saved before is intact: begin a new run with --start and a lower learning_rate"
+            )
         if process.count > 1:
             distributed.require_agreement(arrays, process)
             progress.say(f"{process}, call {call.index + 1}: parameters {distributed.digest(arrays)}")
@@ -120,14 +134,15 @@ def _run_call(
 ) -> Params:
     """One `ppo.train` from the given parameters."""
     the_env = make_env(config, call.stage, call.lesson)
-    if params is not None and call.noise is not None:
-        params = networks.with_noise(params, call.noise)
+    if call.noise is not None:
+        config = dataclasses.replace(config, network=dataclasses.replace(config.network, initial_noise=call.noise))
+        params = None if params is None else networks.with_noise(params, call.noise)
 
     def report(steps: int, metrics: dict[str, Any]) -> None:
         progress.update(call, steps, _figures(metrics, config.policy_period))
 
     def look(steps: int, make_policy: Any, params: Any) -> None:
-        if wants_to_stop():
+        if steps < call.steps and wants_to_stop():  # else the call is finished, and about to be saved
             raise Stopped
 
     look_back = round(_LOOK_BACK / config.policy_period)

@@ -22,6 +22,7 @@ from bipedtrack.checkpoint import (
     load_arrays,
     save_arrays,
     write_json,
+    write_text,
 )
 
 ARRAYS = {"actor/0/kernel": np.arange(12, dtype=np.float32).reshape(3, 4), "count": np.array(7, np.int64)}
@@ -346,3 +347,12 @@ def test_a_disk_without_any_space(tmp_path):
     (tmp_path / "progress.jsonl").symlink_to("/dev/full")
     with pytest.raises(RunError, match="progress.jsonl: cannot be written: No space left on device"):
         append_jsonl(tmp_path / "progress.jsonl", {})
+
+
+@pytest.mark.parametrize("name", [".", "folder", "folder/"])
+def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, name):
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RunError, match="is a folder; wanted the name of a file"):
+        write_text(name, "text")
+    assert [path.name for path in tmp_path.rglob("*")] == ["folder"]

@@ -44,6 +44,16 @@ def test_without_a_place_everything_still_works(tmp_path: pathlib.Path) -> None:
     assert use_cache(tmp_path) == "None None"
 
 
+def test_a_user_without_a_home_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> pathlib.Path:
+        raise RuntimeError("Could not determine home directory.")  # as pathlib does it
+
+    for name in ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pathlib.Path, "home", nowhere)
+    assert compilation.use_cache() is None
+
+
 def test_another_version_has_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     here = compilation._machine()
     rows = [row._replace(found="9.9.9") if row.name == "jaxlib" else row for row in versions.check()]

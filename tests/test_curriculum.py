@@ -158,11 +158,14 @@ def refused(folder: pathlib.Path, text: str) -> str:
 
 
 ADDED = [  # what is put in front, and the line it gives
-    ("[rewards.weights]\n", "rewards.weights: missing keys without a default; wanted live"),
+    ("[rewards.weights]\nliv = 1\n", "rewards.weights.liv: unknown key; did you mean 'live'?"),
+    ("[rewards.weights]\nlive = -1\n", "rewards: weights.live must not be negative, not -1"),
+    ("[rewards.sharpness]\nankle_position = -5\n", "rewards: sharpness.ankle_position must not be negative, not -5"),
+    ("[ranges]\nperiod = [0.09, 0.5, 0.7]\n", "ranges: periods must be at least 0.1 s"),
+    ("[ranges]\nsquat_period = [0, 1, 1.5]\n", "ranges: periods must be at least 0.1 s"),
     ("[ranges]\nwalk_stp = [0, 0, 0]\n", "ranges.walk_stp: unknown key; did you mean 'walk_step'?"),
     ("[ranges]\nwalk_step = [0, 0]\n", "ranges.walk_step: [0, 0] (list) has the length 2; wanted a list of 3"),
     ("[ranges]\nlift = [0.1, 0.05, 0.2]\n", "ranges: lift must be [lowest, mildest, highest], not [0.1, 0.05, 0.2]"),
-    ("[ranges]\nperiod = [0, 0.5, 0.7]\n", "ranges: periods must be positive"),
     (
         "[rewards.sharpness]\nankle_positon = 1\n",
         "rewards.sharpness.ankle_positon: unknown key; did you mean 'ankle_position'?",
@@ -190,6 +193,7 @@ CHANGED = [  # what stands there, what shall stand there, and the line it gives
     ("steps = 97, ", "", "stages[0].lessons[1]: missing key without a default; wanted steps (an integer)"),
     ("steps = 97", "steps = 0", "stages[0].lessons[1]: steps and parts must be at least 1"),
     ("parts = 4", "parts = 0", "stages[0].lessons[0]: steps and parts must be at least 1"),
+    ("parts = 4", "parts = 4000", "stages[0].lessons[0]: steps and parts must be at least 1, and every part needs a step"),
     ("turn = 0", "turns = 0", "stages[0].shares.turns: unknown key; did you mean 'turn'?"),
     ("stand = 1, squat = 0, walk = 2", "stand = 0, squat = 0, walk = 0", "stages[0].shares: shares must not be negative"),
     ("walk = 2", "walk = -2", "stages[0].shares: shares must not be negative"),

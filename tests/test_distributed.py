@@ -43,9 +43,8 @@ def test_two_processes_agree_to_the_bit_and_go_on_after_one_was_lost(tmp_path: p
         assert first.poll() is None and second.poll() is None and time.monotonic() < until
         time.sleep(0.1)
     second.send_signal(signal.SIGKILL)
-    lost = time.monotonic()
     _, error = first.communicate(timeout=PATIENCE)
-    assert first.returncode != 0 and time.monotonic() - lost < 60
+    assert first.returncode != 0
     assert "another task died" in error or "cannot go on without the others" in error
     said = [second.communicate()[0]]
 
@@ -79,6 +78,7 @@ def test_when_the_first_process_refuses_so_do_the_others(tmp_path: pathlib.Path)
         ("127.0.0.1:1234", 1, 0, False, "--processes 1: wanted the number of processes"),
         ("127.0.0.1:1234", 2, 2, False, "--process 2: wanted 0 to 1"),
         ("127.0.0.1:1234", 2, 0, True, "not both"),
+        ("", 4, 1, True, "--processes and --process need --coordinator HOST:PORT"),
     ],
 )
 def test_what_cannot_be_is_refused(coordinator: str, processes: int, process: int, detect: bool, words: str) -> None:

@@ -87,3 +87,9 @@ def test_the_printed_table_sets_both_controllers_side_by_side() -> None:
         assert text in alone
     for text in ("walk", "75 %", "9.5 s", "3.2 cm", "1.0 deg", "4.0 cm", "2.5 deg"):
         assert text in trained
+
+
+def test_stairs_alone_are_no_level_ground(rows: dict[str, list[Row]]) -> None:
+    assert evaluation.level_ground(rows["trained"][2:]) is None
+    flat = evaluation.level_ground(rows["trained"])
+    assert flat is not None and flat.survival == 0.5 and flat.episodes == 2 * EPISODES

@@ -66,10 +66,16 @@ def test_a_run_from_nothing_does_not_begin_with_what_another_one_left(tmp_path):
 
     with pytest.raises(TypeError):  # after start.npz, before run.json
         RunDirectory.create(tmp_path / "run", {"x": Unwritable()}, checkpoint.Checkpoint(7, numbers(7), {}))
-    assert (tmp_path / "run" / "start.npz").exists()
     run = RunDirectory.create(tmp_path / "run", {})
     assert run.latest() is None and files(run) == ["lock", "run.json"]
     run.close()
+
+
+def test_a_file_of_the_users_stays(tmp_path):
+    (tmp_path / "start.npz").write_bytes(b"mine")
+    with pytest.raises(RunError, match="holds checkpoints without their run.json; use another directory"):
+        RunDirectory.create(tmp_path, {})
+    assert (tmp_path / "start.npz").read_bytes() == b"mine"
 
 
 def test_checkpoints_are_ordered_as_numbers(run):

@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import pathlib
+import re
 import signal
 import subprocess
 import sys
@@ -81,7 +82,6 @@ def refused(*arguments: object, cwd: pathlib.Path) -> str:
 
 class Runs(NamedTuple):
     whole: pathlib.Path  # a run that nobody disturbed
-    whole_cpu_seconds: float
     whole_out: str
     broken: pathlib.Path  # the same run, killed in its second call, then stopped there, then resumed to its end
     second_process: tuple[int, str, str]  # what a second process in the directory said meanwhile
@@ -97,19 +97,22 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     # a curriculum from a file, not by its name
     smoke = (ROOT / "curricula" / "smoke.toml").read_text()
     # 9 updates of 32 steps in the last call, for which brax makes two epochs of 5
-    (folder / "tiny.toml").write_text(smoke.replace('"hold", steps = 192', '"hold", steps = 270'))
+    tiny = smoke.replace('"hold", steps = 192', '"hold", steps = 270')
+    # and less noise than the network's 0.7 from the first lesson on
+    (folder / "tiny.toml").write_text(
+        tiny.replace('"half difficulty", steps = 192', '"half difficulty", noise = 0.6, steps = 192')
+    )
     begin, again = ("--curriculum", "tiny.toml", "--seed", 3), ("--resume", "--out", "broken", "--device", "cpu")
     with (
         open(folder / "whole.out", "w+") as output,
         running(*begin, "--out", "whole", "--device", "cpu", cwd=folder, out=output) as whole,
     ):
         disturbed = broken_run(folder / "broken", begin, again)
-        _, status, usage = os.wait4(whole.pid, 0)
-        whole.returncode = os.waitstatus_to_exitcode(status)
+        whole.wait(PATIENCE)
         output.seek(0)
         said = output.read()
     assert whole.returncode == 0, said
-    return Runs(folder / "whole", usage.ru_utime + usage.ru_stime, said, folder / "broken", *disturbed)
+    return Runs(folder / "whole", said, folder / "broken", *disturbed)
 
 
 def broken_run(broken: pathlib.Path, begin: tuple[object, ...], again: tuple[object, ...]) -> tuple[Any, ...]:
@@ -137,8 +140,7 @@ def broken_run(broken: pathlib.Path, begin: tuple[object, ...], again: tuple[obj
 
 
 @pytest.mark.slow
-def test_smoke_runs_every_stage_checkpoint_and_export_in_minutes(runs: Runs) -> None:
-    assert runs.whole_cpu_seconds < 240  # two minutes on two cores; seconds by the clock depend on what else runs
+def test_smoke_runs_every_stage_checkpoint_and_export(runs: Runs) -> None:
     for call, stage in enumerate(("level ground, half difficulty", "stairs, low risers", "static balance, hold"), start=1):
         assert f"{stage} (call {call} of 3)" in runs.whole_out
     names = sorted(path.name for path in (runs.whole / "checkpoints").iterdir())
@@ -169,7 +171,11 @@ def test_the_run_directory_says_what_was_trained_and_how_it_went(runs: Runs) -> 
     assert [row["steps"] for row in rows] == [192, 384, 544, 704]
     for row in rows:
         assert 0.02 <= row["episode_seconds"] <= 0.4 + 1e-6 and 0 <= row["falls"] <= 1 and row["nonfinite"] == 0
-        assert 0 < row["live"] <= 1 and row["reward_per_step"] > 0 and row["policy_dist_mean_std"] > 0.5
+        assert (
+            0 < row["live"] <= 1
+            and row["reward_per_step"] > 0
+            and row["policy_dist_mean_std"] == pytest.approx(0.6, abs=0.05)
+        )
     assert list((runs.whole / "tensorboard").glob("events.out.tfevents.*"))
 
 
@@ -218,7 +224,9 @@ def test_a_killed_and_resumed_run_ends_in_bitwise_the_same_parameters(runs: Runs
 @pytest.mark.slow
 def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(runs: Runs) -> None:
     folder, first = runs.whole.parent, runs.whole / "checkpoints" / "0002.npz"
-    (folder / "one.toml").write_text("[[stages]]".join((folder / "tiny.toml").read_text().split("[[stages]]")[:2]))
+    one = "[[stages]]".join((folder / "tiny.toml").read_text().split("[[stages]]")[:2])
+    assert "evaluation_episodes = 0" in one
+    (folder / "one.toml").write_text(one.replace("evaluation_episodes = 0", "evaluation_episodes = 1"))
     with running("--curriculum", "one.toml", "--out", "tuned", "--device", "cpu", "--start", first, cwd=folder) as tuned:
         printed = wait_for(tuned, "(call 1 of 1)")
         tuned.send_signal(signal.SIGINT)
@@ -228,8 +236,16 @@ def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(r
     assert began.call == -1 and began.arrays.keys() == source.arrays.keys()
     assert all(np.array_equal(began.arrays[name], source.arrays[name]) for name in source.arrays)
 
+    settings = json.loads((folder / "tuned" / "run.json").read_text())
+    settings["versions"]["jax"] = "0.9.1"
+    (folder / "tuned" / "run.json").write_text(json.dumps(settings))
     status, out, error = train("--resume", "--out", "tuned", "--device", "cpu", cwd=folder)
     assert (status, error) == (0, ""), out + error
+    assert "warning: the run began with jax 0.9.1, and goes on with 0.9.2\n" in out
+    table = json.loads((folder / "tuned" / "table.json").read_text())
+    for name in ("IK alone", "trained"):
+        assert [row["kind"] for row in table[name]] == ["stand", "walk", "sidle", "turn"]
+        assert f"level ground, {name}: " in out and all(0 < row["seconds"] <= 0.4 + 1e-6 for row in table[name])
     trained = policy.load(folder / "tuned" / "policy.npz")
     assert trained.provenance["origin"]["steps"] == 704 and trained.provenance["origin"]["seed"] == 3
     newest = RunDirectory(folder / "tuned").latest()
@@ -256,6 +272,21 @@ def test_what_cannot_be_started_from_is_refused_and_leaves_nothing_behind(runs: 
         assert not (tmp_path / "run").exists()
 
 
+# A training that diverges
+
+
+@pytest.mark.slow
+def test_a_training_that_diverges_says_so_and_saves_nothing_of_it(tmp_path: pathlib.Path) -> None:
+    one = "[[stages]]".join((ROOT / "curricula" / "smoke.toml").read_text().split("[[stages]]")[:2])
+    wild = re.sub(r"learning_rate = \[.*?\]", "learning_rate = [1e30, 1e30]", one)
+    assert wild != one
+    (tmp_path / "wild.toml").write_text(wild)
+    status, _, error = train("--curriculum", "wild.toml", "--out", "run", "--device", "cpu", cwd=tmp_path)
+    assert status == 2 and error.count("\n") == 1, error
+    assert "stage 'level ground', lesson 'half difficulty': the training diverged" in error
+    assert RunDirectory(tmp_path / "run").latest() is None
+
+
 # Refusals
 
 
@@ -277,6 +308,8 @@ REFUSALS = {  # the arguments and a part of the line
     ("--curriculum", "smok.toml"): "smok.toml: cannot be read",
     ("--curriculum", "robot.toml"): "no robot named 'ranger_mx' in models/; there are: ranger_max",
     ("--curriculum", "period.toml"): "policy_period 0.012 s is no multiple of 0.005 s",
+    ("--curriculum", "slow.toml"): "policy_period 0.1 s is too long; wanted at most 0.08 s",
+    ("--curriculum", "script.toml"): "stage 'level ground': nowhere.csv: cannot be read",
     ("--curriculum", "smoke", "--seed", "-1"): "--seed -1: must not be negative",
     ("--curriculum", "smoke", "--out", "robot.toml"): "robot.toml: cannot be created",
     ("--resume",): "holds no run to resume (no run.json); start one without --resume",
@@ -291,6 +324,9 @@ def test_what_cannot_be_trained_is_refused_in_one_line(
     smoke = (ROOT / "curricula" / "smoke.toml").read_text()
     (tmp_path / "robot.toml").write_text(smoke.replace('"ranger_max"', '"ranger_mx"'))
     (tmp_path / "period.toml").write_text(smoke.replace("policy_period = 0.02 ", "policy_period = 0.012 "))
+    (tmp_path / "slow.toml").write_text(smoke.replace("policy_period = 0.02 ", "policy_period = 0.1 "))
+    scripts = 'scripts = ["nowhere.csv"]\nscript_share = 0.5\nlessons'
+    (tmp_path / "script.toml").write_text(smoke.replace("lessons", scripts, 1))
     (tmp_path / "damaged").mkdir()
     (tmp_path / "damaged" / "run.json").write_text('{"seed": 1}')
     out = () if "--out" in arguments else ("--out", "run")

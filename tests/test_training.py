@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
-from bipedtrack import checkpoint, curriculum, training
+from bipedtrack import checkpoint, control, curriculum, training
 
 
 def test_figures_are_means_over_the_episodes_that_ended() -> None:
@@ -73,3 +74,21 @@ def test_a_stage_with_ranges_of_its_own_draws_from_them() -> None:
     drawn = [training.make_env(config, stage, lesson).given.ranges for stage in stages]
     assert [ranges["stair_riser"].tolist() for ranges in drawn] == [pytest.approx([0.02, 0.17]), pytest.approx([0.1, 0.17])]
     assert drawn[0]["stair_tread"].tolist() == drawn[1]["stair_tread"].tolist()
+
+
+def test_everything_that_a_stage_says_reaches_its_environment() -> None:
+    config = curriculum.load("smoke")
+    own = control.ControlConfig(filter=0.7, level_feet=True)
+    stage = dataclasses.replace(
+        config.stages[0],
+        **{"hold_share": 0.11, "hold_after": (2, 5), "mix_share": 0.12, "break_share": 0.13},
+        **{"scripts": ("hop", "kick"), "script_share": 0.4, "control": own},
+    )
+    lesson = dataclasses.replace(stage.lessons[0], push_share=0.14)
+    env = training.make_env(config, stage, lesson)
+    shares = [float(getattr(env.given, name)) for name in ("hold_share", "mix_share", "break_share", "push_share")]
+    assert shares == pytest.approx([0.11, 0.12, 0.13, 0.14]) and env.given.hold_after.tolist() == [2, 5]
+    assert env.config.control == own != config.control
+    keys = jax.random.split(jax.random.PRNGKey(0), 400)
+    scripted = jax.vmap(lambda key: env.source.begin(key, env.given, env.robot)[0].scripted)(keys)
+    assert 0.3 < float(scripted.mean()) < 0.5
