@@ -29,7 +29,7 @@ class Learner:
     updates: int = 8
     """That are timed at once."""
     devices: int = 0
-    """Devices that the CPU counts as; 0: one for each core."""
+    """Devices that the CPU counts as; 0: one for each core, or fewer that share the robots evenly."""
 
 
 class Constant(brax.envs.Env):
@@ -76,8 +76,8 @@ def products(network: curriculum.NetworkConfig, epochs: int) -> float:
 
 def main(options: Learner) -> None:
     """Prints one line."""
-    measure.use_devices(options.devices)
     config = curriculum.load(options.curriculum)
+    measure.use_devices(options.devices, config.ppo.shares_out)
     rate, compiling = training.speed(config, curriculum.calls(config)[0], Constant(), options.updates)
     limit = measure.matrix_limit()
     found = {"rate": rate, "compile_s": compiling, "matrix_limit_gflops": limit / 1e9}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -13,13 +14,20 @@ import jax
 import jax.numpy as jnp
 
 
-def use_devices(count: int) -> int:
-    """Makes the CPU count as so many devices, 0: one for each core; returns how many local devices there are.
+def use_devices(count: int, shares_out: Callable[[int], bool]) -> int:
+    """Makes the CPU count as so many devices, 0: as many as there are cores, or the most of them that share the work evenly.
 
-    Must come before anything else of JAX.
+    Returns how many local devices there are. Must come before anything else of JAX.
+
+    shares_out: whether a number of devices shares the work evenly.
     """
-    jax.config.update("jax_num_cpu_devices", count or len(os.sched_getaffinity(0)))
-    return jax.local_device_count()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
+    count = count or next(count for count in range(cores, 0, -1) if shares_out(count))
+    jax.config.update("jax_num_cpu_devices", count)
+    found = jax.local_device_count()
+    if not shares_out(found):
+        sys.exit(f"--devices {found}: the robots cannot be shared out evenly; wanted another number")
+    return found
 
 
 def line(**fields: Any) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class Rollout:
     stairs: bool = True
     """Also on stairs, which cost three boxes."""
     devices: int = 0
-    """Devices that the CPU counts as; 0: one for each core."""
+    """Devices that the CPU counts as; 0: one for each core, or fewer that share the robots evenly."""
 
 
 class Rate(NamedTuple):
@@ -112,7 +112,7 @@ def environment(the_env: TrackingEnv, driven: policy.Policy | None, robots: int,
 
 def main(options: Rollout) -> None:
     """Prints a line for every case."""
-    devices = measure.use_devices(options.devices)
+    devices = measure.use_devices(options.devices, lambda count: all(robots % count == 0 for robots in options.robots))
     driven = policy.load_for_simulation(options.policy)
     plan = curriculum.load("best")
     plan = dataclasses.replace(plan, control=driven.settings, policy_period=driven.policy_period)

@@ -35,13 +35,13 @@ class Training:
     peer: bool = True
     """Also brax's humanoid."""
     devices: int = 0
-    """Devices that the CPU counts as; 0: one for each core."""
+    """Devices that the CPU counts as; 0: one for each core, or fewer that share the robots evenly."""
 
 
 def main(options: Training) -> None:
     """Prints a line for the lesson, and one for the peer."""
-    devices = measure.use_devices(options.devices)
     config = curriculum.load(options.curriculum)
+    devices = measure.use_devices(options.devices, config.ppo.shares_out)
     stage = config.stages[options.stage]
     call = next(call for call in curriculum.calls(config) if call.stage is stage)
     the_env = training.make_env(config, stage, call.lesson)
