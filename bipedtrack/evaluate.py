@@ -219,7 +219,7 @@ def _tasks(options: Evaluate, the_robot: robot.Robot) -> tuple[str, ...]:
 
     if options.script is not None:
         footsteps.load(options.script, the_robot, _ranges(options).usual_sway)  # refused before anything is written
-        return (options.script.name,)  # with its suffix: no task is called so
+        return (f"script-{options.script.stem}",)  # as no task of the suite is called, and no hold
     wanted = options.tasks or suite.TASKS
     for name in wanted:
         if name not in suite.TASKS:

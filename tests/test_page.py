@@ -475,4 +475,3 @@ def test_control_steps_are_short_under_a_busy_page(tab: Tab, page: Page, capsys:
         )
     # the browser draws in software and other programs run: only the work can be held to the 5 ms of an idle machine
     assert pace.work_p99_ms < 5.0
-    assert pace.step_ms < 5.0

@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from bipedtrack import config, footsteps, policy, robot
+from bipedtrack import config, footsteps, policy, robot, simulate
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -44,10 +44,48 @@ def test_another_robot_is_simulated_and_evaluated_as_itself(tmp_path: Path) -> N
     assert "no fall" in run("bipedtrack.simulate", "heavy.npz", "walk.csv")
     run("bipedtrack.teleop", "heavy.npz", "--seconds", "0.2", "--port", "0")
     run("bipedtrack.evaluate", "heavy.npz", "--script", "walk.csv", "--engine", "converged")
-    found = json.loads((tmp_path / "evaluation/metrics.json").read_text())["tasks"]["walk"]["policies"]["heavy.npz"]
+    found = json.loads((tmp_path / "evaluation/metrics.json").read_text())["tasks"]["script-walk"]["policies"]["heavy.npz"]
     assert found["converged"]["summary"]["survival"]["falls"] == 0
 
     (tmp_path / "models/heavy/heavy.xml").write_text("<mujoco>\n<worldbody>\n<body/>\n</mujoco>")
     with pytest.raises(AssertionError, match="heavy.npz: .*heavy.xml: is no MJCF that MuJoCo compiles: XML") as refusal:
         run("bipedtrack.simulate", "heavy.npz", "walk.csv")
     assert "Traceback" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["missing.npz", "walk.csv"], "missing.npz: cannot be read"),
+        ([str(ROOT / "models/policies/best.npz"), "missing.csv"], "missing.csv: cannot be read"),
+        ([str(ROOT / "models/policies/best.npz"), "wrong.csv"], "wrong.csv:2: foot is 'middle'"),
+        ([str(ROOT / "models/policies/best.npz"), "walk.csv", "--seconds", "0"], "--seconds 0.0: must be at least 0.1"),
+        ([str(ROOT / "models/policies/best.npz"), "walk.csv", "--seconds", "nan"], "--seconds nan: must be at least 0.1"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    header = ",".join(footsteps.COLUMNS)
+    (tmp_path / "walk.csv").write_text(f"{header}\nleft,0.1\n")
+    (tmp_path / "wrong.csv").write_text(f"{header}\nmiddle,0.1\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["simulate", *arguments])
+    with pytest.raises(SystemExit) as left:
+        simulate.main()
+    said = capsys.readouterr().err
+    assert left.value.code == 2 and said.count("\n") == 1 and said.startswith("bipedtrack: ") and named in said
+
+
+def test_inverse_kinematics_alone_falls_and_the_script_may_last_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    steps = "\n".join(f"{foot},{0.2 * i:.1f}" for i, foot in enumerate(("left", "right") * 4, 1))
+    (tmp_path / "walk.csv").write_text(f"{','.join(footsteps.COLUMNS)}\n{steps}\n")
+    arguments = ["simulate", str(ROOT / "models/policies/best.npz"), str(tmp_path / "walk.csv")]
+    said = []
+    for options in (["--no-feedback"], ["--seconds", "1.5"], ["--seconds", "6"]):
+        monkeypatch.setattr(sys, "argv", [*arguments, *options])
+        simulate.main()
+        said.append(capsys.readouterr().out)
+    assert "fell" in said[0] and said[1].startswith("1.5 s, no fall") and said[2].startswith("6.0 s, no fall")

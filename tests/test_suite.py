@@ -75,6 +75,31 @@ def moving(plan: plans.Plan) -> np.ndarray:
     return np.any([(a != b).reshape(*a.shape[:2], -1).any(axis=-1) for a, b in pairs], axis=0) | (feet(plan) >= 0)
 
 
+# Breaks and footholds anywhere
+
+
+@pytest.mark.parametrize(("name", "usual"), [("walk-breaks", "walk-forward"), ("stairs-breaks", "stairs-up")])
+def test_breaks_pause_or_close_up_between_steps(drawn: Draw, name: str, usual: str) -> None:
+    batch = drawn(name)
+    rests = feet(batch.plan)[:, :16] < 0  # task steps of the first seconds
+    assert not (feet(drawn(usual).plan)[:, :16] < 0).any()
+    paused = rests.any(axis=1)
+    assert 0.2 < paused.mean() < 0.9  # the others bring their feet together
+    assert "pause" in batch.ranges
+    for episode in np.flatnonzero(paused):  # and they go on after it
+        assert not rests[episode, np.flatnonzero(rests[episode])[0] :].all()
+
+
+def test_wandering_goes_anywhere_in_its_ellipse(drawn: Draw) -> None:
+    ahead, aside, up, turned = np.array(ways(drawn("wander").plan)).T
+    outwards = np.abs(aside)
+    ranges = sampling.Ranges()
+    # a foot turns about the middle between the feet, which moves it by up to 0.1 sin(0.25) m
+    assert ranges.wander_x[0] - 0.025 <= ahead.min() < -0.05 and 0.15 < ahead.max() <= ranges.wander_x[2] + 0.025
+    assert 0.08 < outwards.max() <= ranges.wander_y[2] + 0.004 and np.abs(up).max() < 1e-5
+    assert 0.15 < np.abs(turned).max() <= ranges.wander_yaw[2] + 1e-4
+
+
 # Names
 
 

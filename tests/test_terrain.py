@@ -28,11 +28,6 @@ def treads(boxes: np.ndarray) -> np.ndarray:
     return np.array(sorted(found, key=lambda tread: tread[2]))
 
 
-def test_box_is_1_2_by_2_by_0_4_m() -> None:
-    assert STAIR_BOX == (1.2, 2.0, 0.4)
-    assert terrain.STAIR_BOXES == 3
-
-
 def test_boxes_of_stairs_up_worked_by_hand() -> None:
     # treads of 0.3 m: tread i begins at 0.3 (i - 1/2) and reaches 1.2 m forward, under the next ones
     up = stairs(0.15, 0.3)

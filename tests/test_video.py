@@ -1,6 +1,5 @@
 """Films of a trace made by hand: what is in the files, and how bad input is refused."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -258,8 +257,3 @@ def test_a_directory_is_no_place_for_a_film(tmp_path: Path) -> None:
     (tmp_path / "walk.gif").mkdir()
     with pytest.raises(video.VideoError, match="is a directory"):
         video.require_writable(tmp_path / "walk.gif")
-
-
-def test_options_have_the_defaults_of_the_manual() -> None:
-    defaults = {field.name: field.default for field in dataclasses.fields(video.Video)}
-    assert (defaults["size"], defaults["fps"], defaults["feedback"]) == ((640, 480), 30, True)
