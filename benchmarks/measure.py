@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from bipedtrack import train
+
 
 def use_devices(count: int, shares_out: Callable[[int], bool]) -> int:
     """Makes the CPU count as so many devices, 0: as many as there are cores, or the most of them that share the work evenly.
@@ -21,12 +23,11 @@ def use_devices(count: int, shares_out: Callable[[int], bool]) -> int:
 
     shares_out: whether a number of devices shares the work evenly.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
-    count = count or next(count for count in range(cores, 0, -1) if shares_out(count))
+    count = count or next(count for count in range(train.cores(), 0, -1) if shares_out(count))
     jax.config.update("jax_num_cpu_devices", count)
     found = jax.local_device_count()
     if not shares_out(found):
-        sys.exit(f"--devices {found}: the robots cannot be shared out evenly; wanted another number")
+        sys.exit(f"{found} devices: the robots cannot be shared out evenly; wanted another number of devices or of robots")
     return found
 
 

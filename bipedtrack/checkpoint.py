@@ -9,6 +9,7 @@ Only numpy and the standard library: policies load through this module on machin
 """
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
@@ -178,10 +179,10 @@ def write_text(path: str | Path, text: str) -> None:
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Puts `content` at `path`, whole or not at all, even if the power fails. Raises RunError when it cannot be written."""
     path = Path(path)
-    if path.is_dir():
-        raise RunError(f"{path}: is a folder; wanted the name of a file")
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
     with os_errors(path, "written"):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder; wanted the name of a file")
+        unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
         try:
             with open(unfinished, "wb") as file:
                 file.write(content)

@@ -1,4 +1,4 @@
-"""What keeps a robot from making a task step, in words: footholds that cannot be stood on and targets out of reach."""
+"""What keeps a robot from making a task step, in words: footholds, boxes in the way, and targets out of reach."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bipedtrack.robot import LEGS, Robot
 from bipedtrack.terrain import TOLERANCE, Box, ground, overlap, rectangle, standing_feet
 
 _ON_THE_WAY = np.arange(1, 8) / 8  # shares of a step's period at which its targets must be within reach
-_SWUNG = np.arange(1, 24) / 24  # shares at which a foot must be clear of boxes
+_SWUNG = np.arange(1, 16) / 16  # shares at which a foot must be clear of boxes
 Boxes = Mapping[int, Box]  # by the lines that name them
 
 
@@ -59,6 +59,9 @@ def _ground_problems(robot: Robot, boxes: Boxes, nodes: Nodes, foot: int) -> lis
 def _air_problems(robot: Robot, boxes: Boxes, nodes: Nodes, foot: int) -> list[str]:
     """What keeps a foot from being held in the air where it is: the ground, or a box."""
     x, y, z = nodes.ankle_positions[foot] - np.array([0.0, 0.0, robot.ankle_height])
+    inside = boxes_around(robot, boxes, nodes, foot)
+    if inside:
+        return [f"the {LEGS[foot]} foot is inside the box of line {line}; wanted it above, or beside it" for line in inside]
     top = ground(boxes.values(), x, y)
     if z > top + TOLERANCE:
         return []
@@ -66,26 +69,40 @@ def _air_problems(robot: Robot, boxes: Boxes, nodes: Nodes, foot: int) -> list[s
 
 
 def swing_problems(robot: Robot, boxes: Boxes, step: TaskStep) -> list[str]:
-    """The boxes that a foot would pass through on its Bezier curve; those that it begins or ends in are told elsewhere."""
+    """The boxes that a foot would pass through on its way; those that it begins or ends in are told elsewhere."""
     problems = []
-    for foot in _swinging(step) if boxes else []:
-        known = {line for place in (step.start, step.end) for line in boxes_around(robot, boxes, place, foot)}
-        deepest: dict[int, tuple[float, float]] = {}  # by line: how far under the top, and when
-        for share in _SWUNG:
-            along, _ = planner.eased(share, step.ease)
-            ankles, _ = planner.bezier(step.ankle_points, along)
-            yaws = step.start.ankle_yaws + share * (step.end.ankle_yaws - step.start.ankle_yaws)
-            on_the_way = step.end._replace(ankle_positions=ankles, ankle_yaws=yaws)
-            for line in boxes_around(robot, boxes, on_the_way, foot):
-                depth = boxes[line].top - (ankles[foot, 2] - robot.ankle_height)
-                deepest[line] = max(deepest.get(line, (0.0, 0.0)), (depth, share * step.period))
+    for foot in _swinging(step):
+        near = _near_swing(robot, boxes, step, foot)
+        if not near:
+            continue
+        known = {line for place in (step.start, step.end) for line in boxes_around(robot, near, place, foot)}
+        deepest: dict[int, tuple[float, float]] = {}  # by line: how far under the top, m, and when, s
+        for time in step.period * _SWUNG:
+            on_the_way = planner.command(step, time).target
+            for line in boxes_around(robot, near, on_the_way, foot):
+                depth = near[line].top - (on_the_way.ankle_positions[foot, 2] - robot.ankle_height)
+                deepest[line] = max(deepest.get(line, (0.0, 0.0)), (depth, time))
         problems += [
             f"the {LEGS[foot]} foot passes through the box of line {line}, {_cm(depth)} under its top {time:.2f} s into the "
-            "step; wanted a higher lift, or a way around it"
+            "step; wanted another lift, or a way around it"
             for line, (depth, time) in deepest.items()
             if line not in known
         ]
     return problems
+
+
+def _near_swing(robot: Robot, boxes: Boxes, step: TaskStep, foot: int) -> Boxes:
+    """The boxes that a foot might meet: no curve leaves the hull of its control points."""
+    low, high = step.ankle_points[foot].min(axis=0), step.ankle_points[foot].max(axis=0)
+    reach = np.hypot(*robot.sole) / 2
+    return {
+        line: box
+        for line, box in boxes.items()
+        if box.z < high[2]
+        and box.top > low[2] - robot.ankle_height + TOLERANCE
+        and (box.corners.min(axis=0) < high[:2] + reach).all()
+        and (box.corners.max(axis=0) > low[:2] - reach).all()
+    }
 
 
 def support_problems(robot: Robot, boxes: Boxes, step: TaskStep) -> list[str]:

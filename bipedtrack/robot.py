@@ -2,9 +2,10 @@
 
 A robot is a folder `models/<name>/` with `<name>.xml` (MJCF; its position actuators are the PD controllers) and
 `<name>.toml` (what an MJCF does not say). The MJCF names its joints `<leg>_<joint>`, by LEGS and JOINTS, the contact
-spheres of the feet `<leg>_sole_*`, and the bodies `trunk`, which is free and whose frame is F_B, and `<leg>_foot`. Nothing
-is written twice: lengths, ranges and gains come from the compiled model, so this module needs MuJoCo, but only inside the
-functions that load.
+spheres of the feet `<leg>_sole_*`, and the bodies `trunk`, which is free and whose frame is F_B, and `<leg>_foot`. Thigh,
+shank and foot hang straight below one another, alike in both legs, on joints with AXES and ranges; their servos have kp, kv
+and forcerange. Nothing is written twice: lengths, ranges and gains come from the compiled model, so this module needs
+MuJoCo, but only inside the functions that load.
 """
 
 from __future__ import annotations
@@ -153,29 +154,35 @@ def from_model(name: str, model: Any, description: Description) -> Robot:
 
 
 def _check_joints(name: str, model: Any, joints: list[Any]) -> None:
-    """Raises RobotError where a joint is not one of a leg, or has no limits, no gains or no limit of its torque."""
+    """Raises RobotError where a joint is none of a leg's, or its servo is none of a PD controller with limits."""
     for i, joint in enumerate(joints):
-        axis = AXES[joint.name.removeprefix(f"{LEGS[0]}_").removeprefix(f"{LEGS[1]}_")]
-        if not (np.allclose(joint.axis, axis) and np.allclose(joint.pos, 0)):
-            raise RobotError(f"{name}: {joint.name} must turn about {list(axis)} at its body's origin")
-        if not joint.range[0] < joint.range[1]:
+        axis = AXES[joint.name.split("_", 1)[1]]
+        if not (np.allclose(joint.axis, axis) and np.allclose(joint.pos, 0) and joint.qpos0[0] == 0):
+            raise RobotError(f"{name}: {joint.name} must turn about {list(axis)} at its body's origin, from 0 on (no ref)")
+        if not (model.jnt_limited[joint.id] and joint.range[0] < joint.range[1]):
             raise RobotError(f"{name}: {joint.name} has no range")
-        kp, kd = model.actuator_gainprm[i, 0], -model.actuator_biasprm[i, 2]
-        if model.actuator_biasprm[i, 1] != -kp or not (kp > 0 and kd > 0 and model.actuator_forcerange[i, 1] > 0):
-            raise RobotError(f"{name}: the actuator of {joint.name} must be a position servo with kp, kv and forcerange")
+        kp, kd, limit = model.actuator_gainprm[i, 0], -model.actuator_biasprm[i, 2], model.actuator_forcerange[i, 1]
+        servo = model.actuator_biasprm[i, 1] == -kp and model.actuator_gear[i, 0] == 1 and model.actuator_forcelimited[i]
+        if not (servo and kp > 0 and kd > 0 and limit > 0):
+            raise RobotError(
+                f"{name}: the actuator of {joint.name} must be a position servo with kp, kv and forcerange, gear 1"
+            )
 
 
 def _check_legs(name: str, model: Any, left: list[Any], right: list[Any]) -> None:
-    """Raises RobotError where thigh, shank and foot are not straight below one another, or the legs are not alike."""
+    """Raises RobotError where a leg is not thigh, shank and foot straight below one another, or the legs are not alike."""
     trunk = model.body("trunk").id
     for leg, links in zip(LEGS, (left, right), strict=True):
+        carriers = [links[0]] * 3 + [links[1]] + [links[2]] * 2
+        for joint, link in zip(JOINTS, carriers, strict=True):
+            if model.joint(f"{leg}_{joint}").bodyid[0] != link.id:
+                raise RobotError(f"{name}: {leg}_{joint} must be a joint of body {link.name}")
         for link, parent, what in zip(links, (trunk, links[0].id, links[1].id), ("thigh", "shank", "foot"), strict=True):
             if link.parentid[0] != parent or not np.allclose(link.quat, [1, 0, 0, 0]):
                 raise RobotError(f"{name}: the {leg} {what} must hang, without a turn, on the link above it")
             if what != "thigh" and not (np.allclose(link.pos[:2], 0) and link.pos[2] < 0):
-                raise RobotError(
-                    f"{name}: the {leg} {what} must be straight below the joint above it, not at {list(link.pos)}"
-                )
+                at = link.pos.tolist()
+                raise RobotError(f"{name}: the {leg} {what} must be straight below the joint above it, not at {at}")
     for one, other, what in zip(left, right, ("thighs", "shanks", "feet"), strict=True):
         alike = (one.pos[[0, 2]], one.mass, one.ipos[[0, 2]]), (other.pos[[0, 2]], other.mass, other.ipos[[0, 2]])
         if not all(map(np.allclose, *alike)):

@@ -56,13 +56,15 @@ class RunDirectory:
             if run._settings_file.exists():
                 raise RunError(f"{path}: already holds a run; go on with --resume or use another directory")
             if run._indices() or run._start.exists():
-                raise RunError(f"{path}: holds checkpoints without their run.json; use another directory")
+                named = run._start.name if run._start.exists() else "checkpoints"
+                raise RunError(f"{path}: holds {named} without a run.json; use another directory")
             try:
                 if start is not None:
                     save_arrays(run._start, start.arrays, {"index": -1, "meta": start.meta}, "checkpoint")
                 write_json(run._settings_file, settings)
             except BaseException:
-                run._start.unlink(missing_ok=True)
+                if not run._settings_file.exists():
+                    run._start.unlink(missing_ok=True)
                 raise
         except BaseException:
             run.close()

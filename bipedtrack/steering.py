@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bipedtrack import footholds, footsteps, kinematics, rotations
+from bipedtrack import footholds, footsteps, kinematics, rotations, terrain
 from bipedtrack.footholds import Foothold
 from bipedtrack.footsteps import Box
 from bipedtrack.nodes import Nodes
@@ -263,12 +263,16 @@ def _trunk(robot: Robot, ankles: np.ndarray, yaws: np.ndarray, asked: Steering) 
 
 
 def _lift(robot: Robot, boxes: Sequence[Box], start: Nodes, to: Foothold, asked: Steering) -> tuple[float, bool]:
-    """The lift that clears what lies between where the foot stands and its foothold, m, and whether that is uneven."""
+    """The lift that clears what lies between where the foot stands and its foothold, m, and whether that is uneven.
+
+    It is looked for under the middle and the corners of the sole, turned as at its foothold.
+    """
     if not boxes:
         return asked.lift, False
     x, y, ankle = start.ankle_positions[to.foot]
     way = np.linspace([x, y], [to.x, to.y], 2 + math.ceil(math.dist((x, y), (to.x, to.y)) / (2 * footholds.GRAIN)))
-    heights = [footsteps.ground(boxes, *point) for point in way]
+    sole = [np.zeros(2), *terrain.rectangle(np.zeros(2), to.yaw, *robot.sole)]
+    heights = [max(footsteps.ground(boxes, *(point + part)) for part in sole) for point in way]
     ends = max(float(ankle) - robot.ankle_height, heights[-1])
     return max(asked.lift, max(heights) - ends + _CLEARANCE), max(heights) - min(heights) > 1e-3
 

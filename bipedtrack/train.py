@@ -138,10 +138,14 @@ def use_devices(device: str, count: int, ppo: curriculum.PpoConfig, process: Pro
     return count, f"{count} x {found[0].device_kind}{processes}"
 
 
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
+
+
 def _cores_with_work(ppo: curriculum.PpoConfig, processes: int) -> int:
     """The greatest number of cores that share the robots evenly with at least _ROBOTS_A_CORE each; at least 1."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
-    most = min(cores, ppo.num_envs // processes // _ROBOTS_A_CORE)
+    most = min(cores(), ppo.num_envs // processes // _ROBOTS_A_CORE)
     return next((count for count in range(most, 1, -1) if ppo.shares_out(count * processes)), 1)
 
 
@@ -257,14 +261,18 @@ def _train_along(job: Job, process: Process) -> None:
 
 
 def _circumstances(process: Process) -> dict[str, Any]:
-    """What besides curriculum, seed and devices decides the last bits of a training."""
-    return {"processes": process.count, "versions": {row.name: row.found for row in versions.check()}}
+    """What besides curriculum, seed and number of devices decides the last bits of a training; devices must be chosen."""
+    import jax
+
+    kind = jax.local_devices()[0].device_kind
+    return {"device": kind, "processes": process.count, "versions": {row.name: row.found for row in versions.check()}}
 
 
 def _changes(began: dict[str, Any], job: Job, process: Process) -> list[str]:
     """What is not as the run began with it, in words; the parameters will be others than without the change."""
     now = {"devices": job.devices, **_circumstances(process)}
-    found = [(name, began.get(name, now[name]), now[name]) for name in ("devices", "processes")]
+    began = {"devices": 1, **began}  # as `curriculum.of_run` has it
+    found = [(name, began.get(name, now[name]), now[name]) for name in ("device", "devices", "processes")]
     before = began.get("versions", now["versions"])
     found += [(name, before.get(name), version) for name, version in now["versions"].items()]
     return [f"the run began with {name} {old}, and goes on with {new}" for name, old, new in found if old != new]

@@ -51,7 +51,7 @@ class Stopped(Exception):
 
 
 class DivergedError(Refusal, RuntimeError):
-    """A call ended with parameters that are not finite; the message is one line."""
+    """A call has come to parameters that are not finite; the message is one line."""
 
 
 def make_env(config: curriculum.Curriculum, stage: curriculum.Stage, lesson: curriculum.Lesson) -> env.TrackingEnv:
@@ -104,12 +104,6 @@ def train(
             raise Stopped
         params = _run_call(config, call, seed, devices, params, progress, wants_to_stop)
         arrays = networks.to_arrays(params)
-        broken = [name for name, array in arrays.items() if not np.isfinite(array).all()]
-        if broken:
-            raise DivergedError(
-                f"stage {call.stage.name!r}, lesson {call.lesson.name!r}: the training diverged, {broken[0]} is not finite; "
-                "what was saved before is intact: begin a new run with --start and a lower learning_rate"
-            )
         if process.count > 1:
             distributed.require_agreement(arrays, process)
             progress.say(f"{process}, call {call.index + 1}: parameters {distributed.digest(arrays)}")
@@ -120,6 +114,8 @@ def train(
         # program in the cache on disk
         jax.clear_caches()
     distributed.part(process)
+    if wants_to_stop():  # in the last call, which is saved
+        raise Stopped
     return params
 
 
@@ -142,6 +138,11 @@ def _run_call(
         progress.update(call, steps, _figures(metrics, config.policy_period))
 
     def look(steps: int, make_policy: Any, params: Any) -> None:
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params)):
+            raise DivergedError(
+                f"stage {call.stage.name!r}, lesson {call.lesson.name!r}: the training diverged, parameters are not finite; "
+                "begin a new run with a lower learning_rate, with --start where an earlier call of this one was saved"
+            )
         if steps < call.steps and wants_to_stop():  # else the call is finished, and about to be saved
             raise Stopped
 

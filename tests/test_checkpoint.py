@@ -353,6 +353,6 @@ def test_a_disk_without_any_space(tmp_path):
 def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, name):
     (tmp_path / "folder").mkdir()
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(RunError, match="is a folder; wanted the name of a file"):
+    with pytest.raises(RunError, match="cannot be written: it is a folder; wanted the name of a file"):
         write_text(name, "text")
     assert [path.name for path in tmp_path.rglob("*")] == ["folder"]

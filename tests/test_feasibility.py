@@ -24,6 +24,7 @@ WRONG = {
     "under a low roof": ("# box 0.3 0.1 0.02 0 0.4 0.1 0.1\nleft,0.3,0.1,0", 3, "inside the box of line 2"),
     # the foot is at most 8 cm high
     "through a wall": ("# box 0.2 0.1 0 0 0.04 0.1 0.3\nleft,0.4", 3, "foot passes through the box of line 2, 2"),
+    "toes held inside a box": ("# box 0.3 0.1 0 0 0.2 0.4 0.3\nleft up,0.15,0.1,0.05", 3, "inside the box of line 2"),
     "over the edge when turned": ("# box 0.2 0.1 0 0 0.16 0.1 0.05\nleft,0.2,0.1,,0.3", 3, "in the air: under 4"),
 }  # fmt: skip
 

@@ -346,6 +346,21 @@ def a_shank_stands_forward(spec: mujoco.MjSpec) -> None:
     spec.joint("left_knee").parent.pos = [0.03, 0, -0.4]
 
 
+def a_knee_is_geared(spec: mujoco.MjSpec) -> None:
+    spec.actuator("left_knee").gear[0] = 2
+
+
+def a_knee_is_zero_where_it_is_bent(spec: mujoco.MjSpec) -> None:
+    spec.joint("left_knee").ref = math.radians(20)
+
+
+def an_ankle_rolls_below_its_pitch(spec: mujoco.MjSpec) -> None:
+    foot = spec.body("left_foot")
+    spec.delete(spec.joint("left_ankle_roll"))
+    sole = foot.add_body(name="left_sole", pos=[0.02, 0, -0.03], mass=0.1, inertia=[1e-4, 1e-4, 1e-4])
+    sole.add_joint(name="left_ankle_roll", axis=[1, 0, 0], range=[-0.5, 0.5])
+
+
 def a_thigh_is_heavy(spec: mujoco.MjSpec) -> None:
     for geom in spec.joint("right_hip_pitch").parent.geoms:
         geom.mass *= 1.5
@@ -366,10 +381,13 @@ def the_soles_are_missing(spec: mujoco.MjSpec) -> None:
         (a_shank_is_short, r"leg_length \[0.35, 0.74\]: a leg is 0.7 m long at most"),
         (the_soles_are_missing, "no geom is named left_sole"),
         (a_knee_bends_backwards, r"left_knee must turn about \[0, 1, 0\] at its body's origin"),
+        (a_knee_is_zero_where_it_is_bent, "left_knee must turn about .* from 0 on"),
+        (a_knee_is_geared, "the actuator of left_knee must be a position servo .* gear 1"),
+        (an_ankle_rolls_below_its_pitch, "left_ankle_roll must be a joint of body left_foot"),
         (a_knee_has_no_range, "right_knee has no range"),
         (a_knee_is_driven_by_a_motor, "the actuator of left_knee must be a position servo"),
         (a_knee_has_any_torque, "the actuator of left_knee must be a position servo"),
-        (a_shank_stands_forward, "the left shank must be straight below the joint above it"),
+        (a_shank_stands_forward, r"the left shank must be straight below the joint above it, not at \[0.03, 0.0, -0.4\]"),
         (a_thigh_is_heavy, "both thighs must hang and weigh the same"),
     ],
 )

@@ -73,7 +73,7 @@ def test_a_run_from_nothing_does_not_begin_with_what_another_one_left(tmp_path):
 
 def test_a_file_of_the_users_stays(tmp_path):
     (tmp_path / "start.npz").write_bytes(b"mine")
-    with pytest.raises(RunError, match="holds checkpoints without their run.json; use another directory"):
+    with pytest.raises(RunError, match="holds start.npz without a run.json; use another directory"):
         RunDirectory.create(tmp_path, {})
     assert (tmp_path / "start.npz").read_bytes() == b"mine"
 
@@ -145,7 +145,7 @@ def test_a_run_is_neither_started_twice_nor_resumed_from_nothing(run, tmp_path):
     resumed.close()
 
     (run.path / "run.json").unlink()
-    with pytest.raises(RunError, match="holds checkpoints without their run.json"):
+    with pytest.raises(RunError, match="holds checkpoints without a run.json"):
         RunDirectory.create(run.path, {})
 
 

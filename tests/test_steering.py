@@ -9,6 +9,7 @@ import pytest
 from bipedtrack import footsteps, kinematics, rotations, sampling, steering
 from bipedtrack import robot as robots
 from bipedtrack.footholds import Foothold
+from bipedtrack.footsteps import Box
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 from bipedtrack.steering import Steering
 
@@ -106,3 +107,14 @@ def test_a_trunk_beyond_reach_is_brought_back_or_stays(robot: robots.Robot) -> N
     assert none is None and "stays where it is: the" in note
     planned, left = steering.following(robot, (), apart, steering.Wishes(steering=Steering(trunk_roll=0.05), trunk=True))
     assert np.array_equal(planned.step.end.trunk_position, apart.trunk_position) and planned.note == note and not left.trunk
+
+
+def test_a_walk_steps_over_what_only_the_edge_of_a_sole_would_meet(robot: robots.Robot) -> None:
+    # a bar of 10 cm beside the way, a centimetre of it in the way of the left sole
+    bar = Box(0.6, 0.24, 0, 0, 0.05, 0.2, 0.10)
+    start = footsteps.initial_nodes(robot)
+    for index in range(12):
+        planned = steering.walk(robot, (bar,), start, index % 2, Steering(ahead=1))
+        assert "no step" not in planned.note
+        start = planned.step.end
+    assert start.trunk_position[0] > 0.9

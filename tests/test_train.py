@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import pathlib
-import re
 import signal
 import subprocess
 import sys
@@ -244,7 +243,7 @@ def test_a_run_that_starts_from_another_begins_with_its_parameters_and_says_so(r
     assert "warning: the run began with jax 0.9.1, and goes on with 0.9.2\n" in out
     table = json.loads((folder / "tuned" / "table.json").read_text())
     for name in ("IK alone", "trained"):
-        assert [row["kind"] for row in table[name]] == ["stand", "walk", "sidle", "turn"]
+        assert [row["kind"] for row in table[name]] == ["stand", "squat", "walk", "sidle", "turn"]
         assert f"level ground, {name}: " in out and all(0 < row["seconds"] <= 0.4 + 1e-6 for row in table[name])
     trained = policy.load(folder / "tuned" / "policy.npz")
     assert trained.provenance["origin"]["steps"] == 704 and trained.provenance["origin"]["seed"] == 3
@@ -270,21 +269,6 @@ def test_what_cannot_be_started_from_is_refused_and_leaves_nothing_behind(runs: 
     }.items():
         assert wanted in refused("--curriculum", "smoke", "--out", "run", "--device", "cpu", *arguments, cwd=tmp_path)
         assert not (tmp_path / "run").exists()
-
-
-# A training that diverges
-
-
-@pytest.mark.slow
-def test_a_training_that_diverges_says_so_and_saves_nothing_of_it(tmp_path: pathlib.Path) -> None:
-    one = "[[stages]]".join((ROOT / "curricula" / "smoke.toml").read_text().split("[[stages]]")[:2])
-    wild = re.sub(r"learning_rate = \[.*?\]", "learning_rate = [1e30, 1e30]", one)
-    assert wild != one
-    (tmp_path / "wild.toml").write_text(wild)
-    status, _, error = train("--curriculum", "wild.toml", "--out", "run", "--device", "cpu", cwd=tmp_path)
-    assert status == 2 and error.count("\n") == 1, error
-    assert "stage 'level ground', lesson 'half difficulty': the training diverged" in error
-    assert RunDirectory(tmp_path / "run").latest() is None
 
 
 # Refusals

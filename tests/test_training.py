@@ -1,12 +1,16 @@
 """The calls of a training: their environments, seeds, figures and provenance."""
 
 import dataclasses
+import pathlib
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
-from bipedtrack import checkpoint, control, curriculum, training
+from bipedtrack import checkpoint, control, curriculum, networks, training
+from bipedtrack.progress import Aside
+from bipedtrack.run_directory import RunDirectory
 
 
 def test_figures_are_means_over_the_episodes_that_ended() -> None:
@@ -92,3 +96,37 @@ def test_everything_that_a_stage_says_reaches_its_environment() -> None:
     keys = jax.random.split(jax.random.PRNGKey(0), 400)
     scripted = jax.vmap(lambda key: env.source.begin(key, env.given, env.robot)[0].scripted)(keys)
     assert 0.3 < float(scripted.mean()) < 0.5
+
+
+@pytest.mark.filterwarnings("ignore:jax.device_put_replicated")
+@pytest.mark.parametrize(("behind", "saved"), [(0, True), (32, False)])
+def test_a_stop_in_the_last_epoch_of_a_call_keeps_the_call(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, behind: int, saved: bool
+) -> None:
+    config, asked = curriculum.load("smoke"), []
+    params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), networks.template(config))
+
+    def ppo(num_timesteps: int, policy_params_fn: Any, **_: Any) -> Any:
+        policy_params_fn(0, None, params)
+        asked.append("Ctrl-C")
+        policy_params_fn(num_timesteps - behind, None, params)
+        return None, params, None
+
+    monkeypatch.setattr(training.ppo, "train", ppo)
+    run = RunDirectory.create(tmp_path / "run", {})
+    with pytest.raises(training.Stopped):
+        training.train(config, run, 0, 1, Aside(), lambda: bool(asked))
+    found = run.latest()
+    assert (found is not None) == saved and asked == ["Ctrl-C"]
+    run.close()
+
+
+@pytest.mark.filterwarnings("ignore:jax.device_put_replicated")
+def test_parameters_that_are_not_finite_end_the_training(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = curriculum.load("smoke")
+    params = jax.tree.map(
+        lambda leaf: np.full(leaf.shape, np.inf if leaf.dtype == np.float32 else 0, leaf.dtype), networks.template(config)
+    )
+    monkeypatch.setattr(training.ppo, "train", lambda policy_params_fn, **_: policy_params_fn(32, None, params))
+    with pytest.raises(training.DivergedError, match="lesson 'half difficulty': the training diverged"):
+        training.train(config, None, 0, 1, Aside(), lambda: False)
