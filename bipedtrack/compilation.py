@@ -33,11 +33,8 @@ def use_cache() -> pathlib.Path | None:
         if state.st_uid != os.getuid():
             return None
         folder.chmod(0o700)
-    except (
-        OSError,
-        RuntimeError,
-    ):  # a full or read-only disk, or a user without a home: everything works without, only slower
-        return None
+    except (OSError, RuntimeError):
+        return None  # a full or read-only disk, or a user without a home: everything works without, only slower
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST)
     return folder

@@ -60,7 +60,7 @@ def test_limits_are_those_of_training() -> None:
     for mine, theirs in twins.items():
         low, _, high = getattr(ranges, theirs)
         assert steering.LIMITS[mine][1] == high
-        # a drive has directions where training has signs, steps of 4 cm are the least lift of both, and periods are periods
+        # where training has a sign for the direction, a drive has a wish, and the least step worth making
         least = {"step_length": 0.02, "sidle_length": 0.02, "turn_angle": 0.02}.get(mine, low)
         assert steering.LIMITS[mine][0] == least
 
