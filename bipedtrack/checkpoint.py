@@ -180,9 +180,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     """Puts `content` at `path`, whole or not at all, even if the power fails. Raises RunError when it cannot be written."""
     path = Path(path)
     with os_errors(path, "written"):
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, "it is a folder; wanted the name of a file")
-        unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
+        unfinished = _beside(path)
         try:
             with open(unfinished, "wb") as file:
                 file.write(content)
@@ -197,6 +195,21 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             os.fsync(directory)  # the new name, too, must be on the disk
         finally:
             os.close(directory)
+
+
+def require_writable(path: str | Path) -> None:
+    """Raises RunError as `write_bytes` does, before there is anything to write; changes nothing."""
+    with os_errors(path, "written"):
+        trial = _beside(Path(path))
+        trial.touch()
+        trial.unlink()
+
+
+def _beside(path: Path) -> Path:
+    """Where a file is written before it is moved to its place. Raises OSError where that is a folder."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "it is a folder; wanted the name of a file")
+    return path.absolute().with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
 
 
 def append_jsonl(path: str | Path, record: Any) -> None:

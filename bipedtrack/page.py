@@ -15,7 +15,7 @@ import viser.uplot
 
 from bipedtrack import footholds, footsteps, policy, scripts, steering
 from bipedtrack.drive import Drive, Mode, View
-from bipedtrack.realtime import VIEW_SECONDS, RealTime, Sample
+from bipedtrack.realtime import SPEEDS, VIEW_SECONDS, RealTime, Sample
 from bipedtrack.scene import Scene
 from bipedtrack.steering import LIMITS, Steering
 
@@ -121,8 +121,8 @@ class Page:
         """What the drive answers, or None where it refuses; why stands on the page then."""
         try:
             return self.clock.ask(request)
-        except (ValueError, RuntimeError, OSError, TimeoutError) as error:
-            self._say(str(error), wrong=True)
+        except (ValueError, RuntimeError, OSError) as error:  # TimeoutError is an OSError without words
+            self._say(str(error) or "the drive does not answer", wrong=True)
             return None
 
     def _say(self, words: str, wrong: bool = False) -> None:
@@ -207,7 +207,8 @@ class Page:
         gui.add_button("save").on_click(self._save)
         gui.add_button("the drive so far as a script").on_click(lambda _: self._write_down())
         upload = gui.add_upload_button("load a file", mime_type=".csv,text/csv,text/plain")
-        self._problems = gui.add_markdown("")
+        # not as Markdown: what a script's cells hold would run in every viewer's browser
+        self._problems: Any = gui.add_text("what is wrong", "", multiline=True, disabled=True, visible=False)
 
         @chosen.on_update
         def _(event: Any) -> None:
@@ -215,15 +216,16 @@ class Page:
 
         @upload.on_upload
         def _(event: Any) -> None:
-            self._set(self._text, "value", event.target.value.content.decode("utf-8", errors="replace"))
+            self._set(self._text, "value", event.target.value.content.decode("utf-8-sig", errors="replace"))
 
     def _run_script(self) -> None:
-        self._set(self._problems, "content", "")
         try:
             script = footsteps.parse(self._text.value, self._robot, "script", steering.FULL_SWAY)
         except footsteps.ScriptError as error:
-            self._set(self._problems, "content", "\n".join(f"- {line}" for line in str(error).splitlines()))
+            self._set(self._problems, "value", str(error))
+            self._set(self._problems, "visible", True)
             return
+        self._set(self._problems, "visible", False)
         self._ask(lambda drive: drive.run(script, self._loop.value))
 
     def _write_down(self) -> None:
@@ -249,7 +251,7 @@ class Page:
         with gui.add_folder("time"):
             self._pause: Any = gui.add_checkbox("pause", False)
             self._pause.on_update(lambda event: setattr(self.clock, "paused", bool(event.target.value)))
-            speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0, hint="below 1: slow motion")
+            speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="below 1: slow motion")
             speed.on_update(lambda event: setattr(self.clock, "speed", float(event.target.value)))
             self._button("single step, 5 ms", self._single_step)
             self._follow = gui.add_checkbox("the camera follows", True)

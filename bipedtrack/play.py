@@ -22,13 +22,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from bipedtrack import paths
+from bipedtrack import addresses, paths
 from bipedtrack.messages import Refusal, fail
 
 if TYPE_CHECKING:
     from bipedtrack.page import Page
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 # One core is enough for the controller; a BLAS with more threads makes its small products wait for one another.
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -62,36 +61,39 @@ def choice(given: pathlib.Path | None) -> dict[str, pathlib.Path]:
     return ready
 
 
-def require_free(host: str, port: int) -> None:
-    """Raises Refusal where nobody can listen: the address is unknown or the port taken."""
+def require_free(host: str, port: int) -> bool:
+    """Whether this computer alone reaches the address. Raises Refusal where nobody can listen: it is unknown or taken."""
     if not 1 <= port <= 65535:
         raise Refusal(f"--port {port}: must be from 1 to 65535")
+    found = addresses.resolve(host, port, socket.SOCK_STREAM)
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as trial:
-            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            trial.bind(address)
+        for address in found:
+            address.bind(reuse=True).close()
     except OSError as error:
         raise Refusal(f"{host}:{port}: cannot listen there ({error.strerror}); wanted another --port or --host") from None
+    return all(address.is_loopback for address in found)
 
 
 @contextlib.contextmanager
 def serve(options: Play) -> Iterator[Page]:
     """A page with a robot that is ready to be driven, until the context ends. Raises Refusal or OSError."""
-    import viser
-
     from bipedtrack import policy
     from bipedtrack.drive import Drive
     from bipedtrack.page import Page, in_loop
     from bipedtrack.realtime import RealTime
+    from bipedtrack.server import Server
 
-    require_free(options.host, options.port)
+    local = require_free(options.host, options.port)
+    if not local:
+        print(f"bipedtrack: --host {options.host}: whoever reaches this machine can drive the robot", file=sys.stderr)
     policies = choice(options.policy)
     loaded = policy.load_for_simulation(next(iter(policies.values())))
     clock = RealTime(Drive(policy.Controller(loaded)))
-    server = viser.ViserServer(options.host, options.port, verbose=False)
+    server = Server(options.host, options.port, local)
     clock.start()
     try:
+        if server.get_port() != options.port:  # viser takes another one where somebody was faster
+            raise Refusal(f"{options.host}:{options.port}: somebody else listens there now; wanted another --port")
         page = in_loop(server, lambda: Page(server, clock, policies))
         drawing = threading.Thread(target=page.run, name="drawing", daemon=True)
         drawing.start()
@@ -114,12 +116,10 @@ def main() -> None:
         os.environ.setdefault(name, "1")
     if importlib.util.find_spec("viser") is None:
         fail("the page needs viser; wanted `pip install '.[play]'` in its clone")
-    if options.host not in LOOPBACK:
-        print(f"bipedtrack: --host {options.host}: whoever reaches this machine can drive the robot", file=sys.stderr)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs would ignore Ctrl-C's signal
     try:
         with contextlib.suppress(KeyboardInterrupt), serve(options):
-            print(f"drive the robot at http://{options.host}:{options.port} (Ctrl-C ends)", flush=True)
+            print(f"drive the robot at {addresses.url(options.host, options.port)} (Ctrl-C ends)", flush=True)
             while True:
                 time.sleep(0.5)  # a signal that another thread got is handled when this one wakes
     except (Refusal, OSError) as error:

@@ -22,6 +22,7 @@ VIEW_SECONDS = 1 / 30  # between two views
 HISTORY_SECONDS = 10.0
 _LATE = 0.25  # s behind the clock from which the lost time is given up
 _SWITCH = 0.0002  # s after which Python lets another thread run, so that page and planning delay no control step for long
+SPEEDS = (0.1, 1.0)  # simulated seconds per second, least and most
 _PLAN_SECONDS = 0.01  # between two looks whether there is something to plan
 
 Answer = TypeVar("Answer")
@@ -68,7 +69,7 @@ class RealTime:
         self.history: deque[Sample] = deque(maxlen=round(HISTORY_SECONDS / VIEW_SECONDS))
         self.view: View = drive.view()
         self.paused = False
-        self.speed = 1.0  # simulated seconds per second that are wanted
+        self._speed = SPEEDS[1]
 
     def start(self) -> None:
         """Lets the time run."""
@@ -92,6 +93,15 @@ class RealTime:
         """One control step, and then a pause."""
         self.paused = True
         self.ask(lambda drive: drive.advance())
+
+    @property
+    def speed(self) -> float:
+        """Simulated seconds per second that are wanted."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, wanted: float) -> None:
+        self._speed = min(max(SPEEDS[0], wanted), SPEEDS[1])  # a number that is being typed may be any, or none
 
     @property
     def pace(self) -> Pace:
@@ -149,6 +159,8 @@ class RealTime:
         self.view = view = self._drive.view()
         if not self.paused:
             self._marks.append((now, view.time))
+        if self.history and self.history[-1].time == view.time:
+            return  # while paused what was there before stays in sight
         errors = view.errors
         self.history.append(
             Sample(

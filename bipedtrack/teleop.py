@@ -22,7 +22,6 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
-import ipaddress
 import json
 import pathlib
 import socket
@@ -33,7 +32,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from bipedtrack import follower, footsteps, kinematics, packets, paths, policy, simulate, trace
+from bipedtrack import addresses, checkpoint, follower, footsteps, kinematics, packets, paths, policy, simulate, trace
 from bipedtrack.messages import Refusal, fail
 from bipedtrack.nodes import Nodes, ankles_in_trunk_frame
 
@@ -183,22 +182,16 @@ class Teleoperation:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A UDP socket bound to an address, after a warning where that is not this computer's own. Raises OSError."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-    except socket.gaierror as error:
-        raise OSError(f"--host {host}: {error.strerror}") from None
-    if not ipaddress.ip_address(address[0]).is_loopback:
+    """A UDP socket bound to an address, after a warning where that is not this computer's own. Raises Refusal."""
+    address = addresses.resolve(host, port, socket.SOCK_DGRAM)[0]
+    if not address.is_loopback:
         print(
             f"bipedtrack: warning: any computer that reaches {host} can steer the robot; nothing is signed", file=sys.stderr
         )
-    bound = socket.socket(family, kind, protocol)
     try:
-        bound.bind(address)
+        return address.bind()
     except OSError as error:
-        bound.close()
-        raise OSError(f"cannot listen on {host} port {port}: {error.strerror or error}") from None
-    return bound
+        raise Refusal(f"cannot listen on {host} port {port}: {error.strerror or error}") from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,8 +228,8 @@ def main() -> None:
             raise Refusal("--record needs --seconds")
         if options.record is not None and options.record.suffix != ".npz":
             raise Refusal(f"--record {options.record}: wanted a name that ends in .npz")
-        if options.record is not None and not options.record.parent.is_dir():
-            raise Refusal(f"--record {options.record}: there is no such folder")
+        if options.record is not None:
+            checkpoint.require_writable(options.record)
         file = options.policy or paths.data_dir("models") / "policies" / "best.npz"
         driven = policy.load_for_simulation(file)
         script = footsteps.load(options.ground, driven.robot) if options.ground else LEVEL_GROUND

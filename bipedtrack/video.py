@@ -119,15 +119,10 @@ def require_writable(path: pathlib.Path, size: tuple[int, int] = (640, 480)) -> 
         _ffmpeg()
         if any(side % 2 for side in size):
             raise VideoError(f"{path}: {size[0]} x {size[1]} pixels do not fit; wanted an even width and height for .mp4")
-    if path.is_dir():
-        raise VideoError(f"{path}: is a directory; wanted a file to write")
-    with contextlib.suppress(_Discard), _whole_file(path) as unfinished:
-        unfinished.touch()
-        raise _Discard
-
-
-class _Discard(Exception):
-    """Ends a `_whole_file` without a file."""
+    try:
+        checkpoint.require_writable(path)
+    except checkpoint.RunError as error:
+        raise VideoError(str(error)) from None
 
 
 @contextlib.contextmanager

@@ -79,6 +79,11 @@ class Tab:
         """What can be read on the page."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
 
+    @property
+    def fields(self) -> str:
+        """What stands in the text fields of the page."""
+        return self.evaluate("[...document.querySelectorAll('textarea')].map(field => field.value).join('\\n')") or ""
+
     def press(self, key: str) -> None:
         """A key, down and up."""
         code = "Space" if key == " " else f"Key{key.upper()}"

@@ -14,7 +14,7 @@ MODULES = {path.stem: path for path in FOLDER.glob("*.py")}
 
 # A module may import those before it: on a line above, or further left on its own.
 LADDER = """
-    messages versions paths record markup drawing
+    messages versions paths addresses record markup drawing
     compilation distributed
     config checkpoint run_directory
     rotations robot
@@ -25,7 +25,7 @@ LADDER = """
     policy follower onnx_export env autoreset
     curriculum adapted_brax networks rollout progress recording suite pictures
     training evaluation sheets comparisons report
-    doctor train curves export evaluate simulate video teleop drive realtime scene page play __main__
+    doctor train curves export evaluate simulate video teleop drive realtime scene server page play __main__
 """.split()
 
 # Between a command and the joint targets: on a robot there is numpy and nothing else.

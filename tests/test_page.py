@@ -118,7 +118,32 @@ def test_pause_slow_motion_and_single_steps(page: Page) -> None:
     at = seconds()
     time.sleep(1.0)
     assert 0.0 < seconds() - at < 0.5
-    page.clock.speed = 1.0
+    for typed, kept in ((0.0, 0.1), (-3.0, 0.1), (7.0, 1.0)):  # on the way to another number
+        page.clock.speed = typed
+        assert page.clock.speed == kept
+    at = seconds()
+    time.sleep(0.2)
+    assert seconds() > at
+
+
+def test_a_pause_leaves_the_plots_alone(page: Page) -> None:
+    page._toggle_pause()
+    before = [sample.time for sample in page.clock.history]
+    time.sleep(0.3)  # nine views
+    assert [sample.time for sample in page.clock.history][:-1] in (before, before[:-1])
+    page._toggle_pause()
+
+
+def test_what_is_wrong_with_a_script_is_text_and_no_markup(page: Page) -> None:
+    header = ",".join(footsteps.COLUMNS)
+    page._text.value = f"{header}\n<script src=//x.yz></script>,0.1\n![](/a.png),0.1\n"
+    page._run_script()
+    assert page._problems.visible and page._problems.value.count("wanted left, right") == 2
+    assert type(page._problems).__name__ == "GuiTextHandle"
+    page._text.value = f"{header}\nleft,0.1\n"
+    page._run_script()
+    assert not page._problems.visible
+    wait_until(lambda: page.clock.view.mode is Mode.SCRIPT)
 
 
 def test_what_the_drive_refuses_reaches_the_one_who_asked(page: Page) -> None:
@@ -404,13 +429,13 @@ def test_a_bad_script_shows_its_error_and_a_good_one_runs_to_its_end(tab: Tab, p
     tab.click("Scripts")
     write(tab, page, "foot,x\nleft,far")
     tab.click("run")
-    wait_until(lambda: "script:1: the header lacks" in tab.text)
+    wait_until(lambda: "script:1: the header lacks" in tab.fields)
     assert page.clock.view.mode is Mode.STEER
     write(tab, page, f"{','.join(footsteps.COLUMNS)}\nleft,0.1\nright,0.2\nleft,0.2")
     tab.click("run")
     wait_until(lambda: "the script is over" in tab.text)
     assert x_of(page) == pytest.approx(0.15, abs=0.05)
-    assert "script:1" not in tab.text
+    assert "script:1" not in tab.fields
 
 
 @browser_tests
@@ -418,14 +443,15 @@ def test_a_script_comes_from_a_file_and_a_drive_goes_into_one(
     tab: Tab, browser: Chromium, page: Page, tmp_path: Path
 ) -> None:
     mine = tmp_path / "mine.csv"
-    mine.write_text(f"{','.join(footsteps.COLUMNS)}\nleft,0.1\nright,0.1\n")
+    text = f"{','.join(footsteps.COLUMNS)}\nleft,0.1\nright,0.1\n"
+    mine.write_text(text, encoding="utf-8-sig")  # as spreadsheets write it
     tab.click("Scripts")
     tab.give(mine)
-    wait_until(lambda: page._text.value == mine.read_text())
+    wait_until(lambda: page._text.value == text)
     tab.click("run")
     wait_until(lambda: "the script is over" in tab.text)
     tab.click("the drive so far as a script")
-    wait_until(lambda: page._text.value != mine.read_text())
+    wait_until(lambda: page._text.value != text)
     tab.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     tab.click("save")
     saved = tmp_path / "script.csv"

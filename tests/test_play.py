@@ -38,11 +38,11 @@ def test_a_port_in_use_is_refused_in_one_line() -> None:
 
 
 def test_it_serves_until_interrupted_and_warns_where_others_may_come_in() -> None:
-    command = [sys.executable, "-m", "bipedtrack.play", "--host", "127.0.0.2", "--port", str(free_port())]
+    command = [sys.executable, "-m", "bipedtrack.play", "--host", "0.0.0.0", "--port", str(free_port())]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, cwd=Path(play.__file__).parent.parent, **pipes) as running:  # type: ignore[call-overload]
         for line in running.stdout:
-            if "http://127.0.0.2" in line and "Ctrl-C" in line:
+            if "http://0.0.0.0" in line and "Ctrl-C" in line:
                 break
         running.send_signal(signal.SIGINT)
         try:
@@ -53,11 +53,21 @@ def test_it_serves_until_interrupted_and_warns_where_others_may_come_in() -> Non
 
 
 @pytest.mark.parametrize(
-    ("host", "port", "words"), [("127.0.0.1", 0, "1 to 65535"), ("no such host", 8080, "cannot listen")]
+    ("host", "port", "words"),
+    [
+        ("127.0.0.1", 0, "1 to 65535"),
+        ("no such host", 8080, "wanted an address"),
+        ("192.0.2.1", 8080, "cannot listen"),
+    ],
 )
 def test_an_address_that_cannot_be(host: str, port: int, words: str) -> None:
     with pytest.raises(Refusal, match=words):
         play.require_free(host, port)
+
+
+def test_whether_others_may_come_in() -> None:
+    assert play.require_free("127.0.0.2", free_port()) is True
+    assert play.require_free("0.0.0.0", free_port()) is False
 
 
 def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

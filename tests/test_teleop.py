@@ -306,15 +306,23 @@ def test_an_address_that_others_reach_is_warned_of() -> None:
         (["--hold", "0"], "--hold"),
         (["--port", "70000"], "--port"),
         (["--host", "999.0.0.1"], "999.0.0.1"),
+        (["--host", "127.0.0..1"], "127.0.0..1"),
         (["--host", "192.0.2.1"], "192.0.2.1"),
         (["--record", "trace.npz"], "--seconds"),
         (["--record", "nowhere/trace.npz", "--seconds", "1"], "nowhere"),
+        (["--record", "folder.npz", "--seconds", "1"], "folder.npz: cannot be written: it is a folder"),
         (["--ground", "missing.csv"], "missing.csv"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    arguments: list[str], named: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    named: str,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.npz").mkdir()
     monkeypatch.setattr(sys, "argv", ["teleop", *arguments])
     with pytest.raises(SystemExit) as left:
         teleop.main()

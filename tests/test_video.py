@@ -255,5 +255,5 @@ def check_refusal(found: subprocess.CompletedProcess[str], message: str) -> None
 
 def test_a_directory_is_no_place_for_a_film(tmp_path: Path) -> None:
     (tmp_path / "walk.gif").mkdir()
-    with pytest.raises(video.VideoError, match="is a directory"):
+    with pytest.raises(video.VideoError, match="it is a folder"):
         video.require_writable(tmp_path / "walk.gif")
