@@ -139,12 +139,18 @@ class Drive:
         """The next task step, from now on."""
         self.step, self._tick = planned.step, 0
         self._sway = self.controller.policy.sway  # as long as the step lasts
-        self.taken.append(planned.step)
+        self._add_taken(planned.step)
         if planned.note:
             self.note = planned.note
         swing = np.flatnonzero(planned.step.swing)
         if swing.size:
             self.wishes = self.wishes._replace(foot=1 - int(swing[0]))
+
+    def _add_taken(self, step: TaskStep) -> None:
+        """Adds a task step to those taken; a hold after a hold makes that one longer, for a robot may stand for days."""
+        if self.taken and step.start is step.end and self.taken[-1].start is self.taken[-1].end:
+            step = step._replace(period=self.taken.pop().period + step.period)
+        self.taken.append(step)
 
     def _next(self) -> Planned:
         """What follows the task step that is over."""
@@ -258,7 +264,9 @@ class Drive:
         if self.mode is not Mode.FALLEN:
             return
         start = self.step.start
-        self.taken.pop()
+        last = self.taken.pop()
+        if last.period > self.step.period:  # of a hold in several parts the robot fell in the last one
+            self.taken.append(last._replace(period=last.period - self.step.period))
         self._steer_on("standing again at the last foothold")
         self._stand(start)
 

@@ -256,7 +256,8 @@ def balanced(robot: Robot, nodes: Nodes, centre: np.ndarray) -> Nodes:
 def problems_of(robot: Robot, boxes: Sequence[Box], step: TaskStep) -> list[str]:
     """What keeps the robot from making a task step, one sentence each; boxes count as lines from 1."""
     by_line = dict(enumerate(boxes, 1))
-    found = feasibility.foothold_problems(robot, by_line, step) + feasibility.reach_problems(robot, step, on_the_way=True)
+    found = feasibility.support_problems(robot, by_line, step) + feasibility.foothold_problems(robot, by_line, step)
+    found += feasibility.reach_problems(robot, step, on_the_way=True)
     return found or feasibility.swing_problems(robot, by_line, step)
 
 

@@ -96,8 +96,14 @@ def clamped(asked: Steering) -> Steering:
 
 
 def following(robot: Robot, boxes: Sequence[Box], start: Nodes, wishes: Wishes) -> tuple[Planned, Wishes]:
-    """The task step after one that ended at `start`, and what is still wished for after it."""
+    """The task step after one that ended at `start`, and what is still wished for after it.
+
+    A foot that is in the air, as after `left up` in a script, comes down first, whatever is asked of the other one.
+    """
     asked = wishes.steering
+    standing = terrain.standing_feet(robot, boxes, start.ankle_positions)
+    if len(standing) == 1 and (wishes.placed is None or wishes.placed.foot == standing[0]):
+        return walk(robot, boxes, start, 1 - standing[0], asked), wishes._replace(walking=asked.moves)
     if wishes.placed is not None:
         return place(robot, boxes, start, wishes.placed, asked), wishes._replace(placed=None, walking=False)
     if asked.moves:

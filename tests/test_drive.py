@@ -79,6 +79,44 @@ def test_a_wish_waits_for_the_next_task_step(drive: Drive) -> None:
     assert drive.step is under_way
 
 
+@pytest.mark.parametrize("wish", ["stop", "ahead", "aside", "trunk_height", "lead", "place"])
+def test_a_foot_that_a_script_holds_up_comes_down_first(drive: Drive, robot: robots.Robot, wish: str) -> None:
+    drive.run(footsteps.load(scripts.ready()["one-legged-stance"], robot))
+    go(drive, 2.5)  # 1.5 s lead to the left foot in the air, which is held there for 3 s
+    {
+        "stop": drive.stop,
+        "ahead": lambda: drive.steer(ahead=1.0),
+        "aside": lambda: drive.steer(aside=-1.0),  # which the right foot would begin
+        "trunk_height": lambda: drive.steer(trunk_height=0.7),
+        "lead": drive.lead,
+        "place": lambda: drive.place(Foothold(1, 0.1, -0.1, 0.0)),
+    }[wish]()
+    go(drive, 5.0)
+    assert drive.mode is Mode.STEER
+    steps = footsteps.parse(drive.as_script(), robot, "drive").steps
+    feet = [int(np.argmax(step.swing)) for step in steps if step.swing.any()]
+    assert feet[:2] == [0, 0]  # up, and down again
+    assert (len(feet) > 2) == (wish in ("ahead", "aside")) and feet[2:3] in ([], [1])
+
+
+def test_holds_in_a_row_are_one(drive: Drive) -> None:
+    go(drive, 3.0)
+    assert len(drive.taken) == 1
+    assert footsteps.duration(footsteps.parse(drive.as_script(), drive.robot, "drive")) == pytest.approx(3.1)
+    drive.steer(ahead=1.0)
+    go(drive, 0.4)
+    drive.stop()
+    go(drive, 3.0)
+    swings = [step.swing.any() for step in drive.taken]
+    assert swings == [False, True, True, False]
+    seconds = sum(float(step.period) for step in drive.taken)
+    assert seconds == pytest.approx(6.4, abs=0.11)  # the hold under way ends later
+    drive.data.qvel[:3] = 20.0  # falls while it holds
+    go(drive, 1.0)
+    drive.stand_up()
+    assert sum(float(step.period) for step in drive.taken) == pytest.approx(seconds, abs=0.21)
+
+
 def test_the_trunk_sways_as_the_policy_learned_it(shipped: policy.Policy) -> None:
     """In the middle of the first step, on the spot: by 0.1 - 0.1 / cosh(w T / 2) m to the stance foot, or not at all."""
     for sway in (0.0, 0.5, 1.0):

@@ -102,10 +102,11 @@ def test_a_trunk_beyond_reach_is_brought_back_or_stays(robot: robots.Robot) -> N
     assert high is not None and 0.77 < high.trunk_height < 0.79 and "brought back within reach" in note
     assert not footsteps.problems_of(robot, (), steering.trunk_step(robot, wide, high))
     # one foot on 0.25 m, where even the default is out of reach: it stays, and says why
+    block = (Box(0.4, 0.1, 0, 0, 0.5, 0.2, 0.25),)
     apart = start._replace(ankle_positions=np.array([[0.4, 0.10, 0.29], [-0.3, -0.10, 0.04]]))
-    none, note = steering.lean(robot, (), apart, Steering(trunk_roll=0.05))
+    none, note = steering.lean(robot, block, apart, Steering(trunk_roll=0.05))
     assert none is None and "stays where it is: the" in note
-    planned, left = steering.following(robot, (), apart, steering.Wishes(steering=Steering(trunk_roll=0.05), trunk=True))
+    planned, left = steering.following(robot, block, apart, steering.Wishes(steering=Steering(trunk_roll=0.05), trunk=True))
     assert np.array_equal(planned.step.end.trunk_position, apart.trunk_position) and planned.note == note and not left.trunk
 
 
