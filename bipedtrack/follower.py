@@ -30,7 +30,7 @@ import numpy as np
 
 from bipedtrack import footsteps, kinematics, planner, rotations, terrain
 from bipedtrack.nodes import NodeRates, Nodes, ankles_in_trunk_frame
-from bipedtrack.packets import FASTEST, Packet, Refused, speed
+from bipedtrack.packets import FASTEST, Packet, Refused, require_upright, speed
 from bipedtrack.planner import Command, TaskStep
 from bipedtrack.robot import Robot
 
@@ -100,6 +100,7 @@ class Follower:
         due = round(interval / self.robot.timestep) + 1
         goal = packet.target if packet.rates is None else _moved(packet.target, packet.rates, due * self.robot.timestep)
         self._check_jump("target", packet.target)
+        require_upright(goal, "with its rates the trunk would be")
         goal = self._reachable(goal)
         if packet.end is not None:
             self._check_jump("end", packet.end, 3.0)

@@ -219,7 +219,12 @@ def _checked_nodes(nodes: Nodes) -> Nodes:
     length = np.linalg.norm(nodes.trunk_orientation) if length < 2 else length
     if not 0.9 < length < 1.1:
         raise Refused("range", "trunk_orientation is no unit quaternion")
-    orientation = nodes.trunk_orientation / length
-    if rotations.to_matrix(orientation)[2, 2] < np.cos(_STEEPEST):
-        raise Refused("range", f"the trunk is tilted by more than {_STEEPEST:g} rad")
-    return nodes._replace(trunk_orientation=orientation)
+    nodes = nodes._replace(trunk_orientation=nodes.trunk_orientation / length)
+    require_upright(nodes, "the trunk is")
+    return nodes
+
+
+def require_upright(nodes: Nodes, subject: str) -> None:
+    """Raises Refused where the trunk is tilted too far. subject: of the sentence."""
+    if rotations.to_matrix(nodes.trunk_orientation)[2, 2] < np.cos(_STEEPEST):
+        raise Refused("range", f"{subject} tilted by more than {_STEEPEST:g} rad")

@@ -84,7 +84,7 @@ def _wrong_version(rng: np.random.Generator) -> bytes:
     return (
         packed(_ahead(rng), 0, NUMBERS, version=version)
         if rng.random() < 0.5
-        else json.dumps(message(version=version)).encode()
+        else json.dumps(message(bipedtrack=version)).encode()
     )
 
 

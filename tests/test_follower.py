@@ -269,6 +269,24 @@ def test_the_time_to_hold_can_be_chosen(robot: Robot) -> None:
     assert follower.state == "returning"
 
 
+@pytest.mark.parametrize("pitch", [0.0, 0.3, 0.49])
+def test_rates_lead_no_trunk_beyond_the_tilt_that_is_allowed(follower: Follower, robot: Robot, pitch: float) -> None:
+    """Packets that come slowly are led on for up to half a second."""
+    rates = NodeRates(np.zeros(3), np.array([0.0, 1.99, 0.0]), np.zeros((2, 3)), np.zeros(2))
+    tilted = footsteps.initial_nodes(robot)._replace(trunk_orientation=rotations.from_euler(0.0, pitch, 0.0))
+    tilts, refused = [], []
+    for tick in range(800):
+        if tick % 50 == 0:
+            try:
+                follower.accept(Packet(tick, tick * DT, tilted, rates))
+            except Refused as refusal:
+                refused.append(refusal.reason)
+        tilts.append(rotations.to_euler(follower.advance().target.trunk_orientation)[1])
+    assert max(tilts) <= 0.5
+    # led on by 0.255 s, at first by two control steps
+    assert refused == ["range"] * len(refused) and (pitch + 1.99 * 0.255 > 0.5) == bool(refused)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_whatever_valid_packets_ask_for_the_targets_stay_smooth_and_within_reach(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
