@@ -11,7 +11,7 @@ import numpy as np
 from bipedtrack import drawing, terrain
 from bipedtrack.record import Run, get, greatest_of, labels_of, mean_of, number, percent, runs_of
 from bipedtrack.robot import LEGS
-from bipedtrack.verdicts import Quantity
+from bipedtrack.verdicts import LEAST_SHARE, Quantity
 
 _NODES = ("trunk", *LEGS)
 NODE_KEY = (
@@ -127,9 +127,14 @@ def lasting(summary: dict[str, Any]) -> Estimate:
 
 
 def ankles(quantity: Quantity) -> Estimator:
-    """The mean over both ankles, their intervals averaged: never narrower than the interval of that mean."""
+    """The mean over both ankles, their intervals averaged: never narrower than the interval of that mean.
+
+    None where too few episodes last: an error before a fall says little about what made the robot fall.
+    """
 
     def estimate(summary: dict[str, Any]) -> Estimate:
+        if (get(summary, "survival", "share") or 0.0) < LEAST_SHARE:
+            return None, None, None
         names = "episode_mean", "episode_low", "episode_high"
         mean, low, high = (mean_of(quantity.of_ankles(summary, name)) for name in names)
         return mean, low, high

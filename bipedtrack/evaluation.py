@@ -23,7 +23,7 @@ class Row:
     episodes: int
     survival: float  # share of the episodes without a fall
     seconds: float  # mean until the fall or the time limit
-    ankle_error_cm: float  # this and the following: means over the time before the fall, averaged over episodes
+    ankle_error_cm: float  # this and the following: means until the fall, averaged over episodes
     ankle_yaw_error_deg: float
     trunk_error_cm: float
     trunk_error_deg: float

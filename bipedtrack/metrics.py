@@ -64,7 +64,7 @@ def summarise(
     - clearance (None without boxes), see `swings.clearances`: swings (that pass an edge), statistics edge_cm,
       below_edge_share of them; side_contact_share of all swings.
     - survival: share without a fall, its 95 % interval share_low, share_high (Wilson), falls, time_to_fall_mean_s of the
-      fallen, time_to_fall_median_s of all (None: fewer than half fell).
+      fallen, time_to_fall_median_s of all (None: no more than half fell).
     - rest: episodes with one, windows, seconds of them; statistics over windows of the fields of `Motion`;
       foot_moved_share of those episodes in which a foot moves by more than 1 cm.
     - effort: torque_rms_nm, saturation_share of all torques, feedback_mean and feedback_max of |a_fb|, power_w.

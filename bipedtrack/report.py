@@ -129,7 +129,7 @@ cm; yaw of the ankles and whole rotation of the trunk, in deg. Mean, median, 95t
 steps of all episodes; over time, the mean over the robots that have not fallen.</li>
 <li><b>Without a fall</b>: share of episodes that last to the end, with Wilson's 95 % interval. A fall is a trunk tilted by
 {math.degrees(falls.TILT):.0f} deg or {falls.DEPTH:g} m below its target, or an ankle {falls.LOST_ANKLE:g} m off its own.
-Time to fall: mean of those that fall; median of all, if half of them fall.</li>
+Time to fall: mean of those that fall; median of all, if more than half of them fall.</li>
 <li><b>Interval of an error</b>: of the mean over the means of the episodes, by Student's t.</li>
 <li><b>Footholds</b>: the ankle against its foothold at the planned instant, whether the foot is down or not. The time is
 when the ground first bears more than {100 * metrics.CONTACT_SHARE:g} % of the weight, from the middle of the swing to half

@@ -21,14 +21,14 @@ class Outcome(NamedTuple):
 
     survived: np.ndarray  # (n,) bool: still up when time was up
     seconds: np.ndarray  # (n,) until the fall, or the whole time
-    errors: dict[str, np.ndarray]  # of ERRORS: (n,) means over the time before the fall
+    errors: dict[str, np.ndarray]  # of ERRORS: (n,) means until the fall, the step in which it comes included
 
 
 class _Tally(NamedTuple):
     """Running sums of one robot's episode."""
 
     alive: Array  # () 1 until the fall
-    steps: Array  # () policy steps before the fall
+    steps: Array  # () policy steps until the fall, that of the fall included
     errors: dict[str, Array]
 
 

@@ -149,24 +149,33 @@ def _off_footholds(run: Run) -> str:
 
 
 def _over_all(runs: list[Run]) -> list[dict[str, Any]]:
-    """The paper's summary of its figures: the mean over the tasks of figures 5 to 10, for the runs of one policy."""
+    """The paper's summary of its figures: the mean over the tasks of figures 5 to 10, for the runs of one policy.
+
+    Not measured where one of them was not run.
+    """
     lines = []
+    missing = len(_MOVES) - len({run.task for run in runs})
     for quantity in QUANTITIES if runs else ():
         legs = zip(*(quantity.of_ankles(run.summary) for run in runs), strict=True)
         claim = _Claim(f"{quantity.claim}, over all tasks", quantity.limit, quantity.unit)
         subject = runs[0]._replace(task=f"mean of {len(runs)} tasks")
         but = _too_short(mean_of(run.lasting for run in runs))
-        lines.append(_verdict(TRAJECTORIES, subject, claim, greatest_of(map(mean_of, legs)), but))
+        value = None if missing else greatest_of(map(mean_of, legs))
+        lines.append(_verdict(TRAJECTORIES, subject, claim, value, but))
     return lines
 
 
 def _balance(run: Run) -> list[dict[str, Any]]:
-    """Whether the posture is kept after a task: nobody falls, the feet stay where they are, and are where they should."""
+    """Whether the posture is kept after a task: nobody falls, the feet stay where they are, and are where they should.
+
+    An episode that falls before its rest has kept no foot in its place.
+    """
     moved, error = get(run.summary, "rest", "foot_moved_share"), greatest_of(POSITION.of_ankles(run.summary))
+    rested, episodes = get(run.summary, "rest", "episodes"), get(run.summary, "episodes")
     but = _too_short(run.lasting)
     if error is not None and error > POSITION.limit:
         but = but or f"the ankles are {error:.1f} cm off their targets on average"
-    stayed = None if moved is None else 100 * (1 - moved)
+    stayed = None if moved is None or not episodes else 100 * (1 - moved) * (rested or 0) / episodes
     return [_verdict(BALANCE, run, _KEEPS_UP, percent(run.lasting)), _verdict(BALANCE, run, _KEEPS_FEET, stayed, but)]
 
 

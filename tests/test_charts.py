@@ -65,6 +65,7 @@ def test_estimates_are_those_of_the_summary() -> None:
     assert charts.lasting(summary(0.5, 3.0)) == (50.0, 25.0, 100.0)
     assert charts.ankles(verdicts.POSITION)(summary(0.5, 3.0)) == (3.0, 2.0, 4.0)
     assert charts.ankles(verdicts.POSITION)(summary(0.5, None)) == (None, None, None)
+    assert charts.ankles(verdicts.POSITION)(summary(0.49, 3.0)) == (None, None, None)  # more than half of them fall
 
 
 def test_policies_stand_below_each_other_on_one_axis() -> None:
@@ -80,14 +81,15 @@ def test_policies_stand_below_each_other_on_one_axis() -> None:
 
 
 def test_a_curve_over_levels_stops_where_its_axis_does() -> None:
-    levels = [{"level": level, **summary(1.0, cm)} for level, cm in ((0.0, 5.0), (10.0, 500.0))]
+    rows = ((0.0, 1.0, 5.0), (10.0, 1.0, 500.0), (20.0, 0.02, 3.0))  # who falls at once is not off for long
+    levels = [{"level": level, **summary(share, cm)} for level, share, cm in rows]
     drawn = Reader(
         charts.ladder({0: {"levels": levels}}, "push", "Error, cm", charts.ankles(verdicts.POSITION), verdicts.POSITION)
     )
     (place,) = (numbers(names["transform"] or "") for names in drawn.named("path", "mark"))
     assert place[1] == numbers(drawn.named("path", "limit")[0]["d"] or "")[1]
     (label,) = (names["aria-label"] for tag, names in drawn.tags if "aria-label" in names)
-    assert label == "Error, cm, over push: 0: 5.00; 10: 500.00"
+    assert label == "Error, cm, over push: 0: 5.00; 10: 500.00; 20: –"
 
 
 def test_the_key_has_the_mark_of_each_policy_by_its_label() -> None:

@@ -190,6 +190,7 @@ def test_survival_worked_by_hand() -> None:
     assert found["time_to_fall_mean_s"] == pytest.approx(0.5)
     assert found["time_to_fall_median_s"] is None  # most of them have not fallen
     trace.alive[2, 140:] = False
+    assert metrics.survival(trace)["time_to_fall_median_s"] is None  # half of them have
     trace.alive[0, 199:] = False
     found = metrics.survival(trace)
     assert (found["share"], found["falls"]) == (0.25, 3)

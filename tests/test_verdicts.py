@@ -87,6 +87,24 @@ def test_over_all_tasks_counts_the_mean_of_the_tasks(record: dict[str, Any]) -> 
     assert verdict(record, "figure 11", "average ankle position")["met"] is False
 
 
+def test_over_all_tasks_is_not_measured_by_some_of_them(record: dict[str, Any]) -> None:
+    assert verdict(record, "figure 11", "average ankle position")["met"] is not None
+    del record["tasks"]["stairs-up"]
+    found = verdict(record, "figure 11", "average ankle position")
+    assert (found["met"], found["figure"], found["task"]) == (None, "not measured", f"mean of {len(MOVES) - 1} tasks")
+
+
+def test_who_falls_before_the_rest_keeps_no_foot_in_its_place(record: dict[str, Any]) -> None:
+    held = summaries(record, "hold-walk-forward")["mjx"]
+    put(held, "survival.share", 1.0)
+    put(held, "rest.foot_moved_share", 0.02)
+    for rested, value in ((256, 98.0), (128, 49.0), (0, 0.0)):
+        put(held, "episodes", 256)
+        put(held, "rest.episodes", rested)
+        found = verdict(record, "figure 12", "maintains its posture: feet")
+        assert found["value"] == pytest.approx(value) and found["met"] is (value >= 95)
+
+
 def test_figures_give_the_worse_ankle_and_both(whole: dict[str, Any]) -> None:
     found = verdict(whole, "figure 6", "average ankle position")
     assert found["value"] == pytest.approx(3.0)
