@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import sys
 import time
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,6 +29,7 @@ from bipedtrack import (
 )
 from bipedtrack.disturbances import LADDERS, UNDISTURBED, Hooks
 from bipedtrack.messages import Refusal, fail, quiet_imports
+from bipedtrack.record import labels_of
 from bipedtrack.swings import Boxes
 
 if TYPE_CHECKING:
@@ -53,7 +55,8 @@ class Evaluate:
     episodes: int = 256
     """Of each random task; a script is the same every time and run once."""
     seconds: float = 10.0
-    """Of each episode, or of the hold at its end; long holds last 60 s, scripts as long as they take."""
+    """Of each episode, or at least of the hold at its end (the sooner it begins the longer it is); long holds last 60 s or
+    more, scripts as long as they take."""
     engine: Literal["mjx", "mujoco", "converged", "both"] = "both"
     """mujoco is MuJoCo C, with the MJCF's solver and, as a further column, a converged one; converged is that alone."""
     sway: float | None = None
@@ -173,7 +176,10 @@ def boxes_of(batch: suite.Batch) -> Boxes | None:
 
 
 def run(options: Evaluate) -> dict[str, Any]:
-    """Evaluates everything asked for, writes it to `out` and returns what metrics.json holds."""
+    """Evaluates everything asked for and returns what metrics.json and the curves of the report hold.
+
+    Both are written to `out` after every task, so that whoever stops it keeps what is done.
+    """
     who = [subject(name, options) for name in options.policies]
     options = dataclasses.replace(options, sway=_sway(who, options))
     wanted = _tasks(options, who[0].robot)
@@ -185,6 +191,7 @@ def run(options: Evaluate) -> dict[str, Any]:
         "policies": {one.name: one.provenance for one in who},
         "tasks": {},
     }
+    labels = labels_of(record)
     for number, one in enumerate(who):
         engines = Engines(one, options.engine)
         weight = float(statics.GRAVITY * robot.build_model(one.robot.name).body_mass.sum())
@@ -203,14 +210,28 @@ def run(options: Evaluate) -> dict[str, Any]:
                 results[engine] = {"summary": _rounded(summary), "course": {k: _thin(v) for k, v in course.items()}}
                 results[engine]["path"] = _path(recorded.episode(0))
                 results[engine]["levels"] = [_level(level, recorded) for level in batch.levels]
-                if engine != "converged" or len(engines.names) == 1:
-                    for episode in range(min(_TRACES, len(recorded.alive))):
-                        file = options.out / "traces" / f"{stem}-{engine}-{name}-{episode}.npz"
-                        trace.save(recorded.episode(episode), file)
-                print(f"{line(one.name, name, engine, summary)}  ({time.monotonic() - began:.0f} s)", flush=True)
+                kept = _TRACES if engine != "converged" or len(engines.names) == 1 else 0
+                results[engine]["traces"] = []
+                for episode in range(min(kept, len(recorded.alive))):
+                    file = f"{stem}-{engine}-{name}-{episode}.npz"
+                    trace.save(recorded.episode(episode), options.out / "traces" / file)
+                    results[engine]["traces"].append(file)
+                print(f"{line(labels[one.name], name, engine, summary)}  ({time.monotonic() - began:.0f} s)", flush=True)
+            _write(record, options.out)
         if options.robustness:
-            record.setdefault("robustness", {})[one.name] = _robustness(engines, one, options, weight)
+            found = _robustness(engines, one, options, weight, labels[one.name])
+            record.setdefault("robustness", {})[one.name] = found
+            _write(record, options.out)
     return record
+
+
+def _write(record: dict[str, Any], out: pathlib.Path) -> None:
+    """metrics.json and report.html, with the verdicts about what has been evaluated so far."""
+    from bipedtrack import report, verdicts
+
+    record["verdicts"] = verdicts.verdicts(record)
+    checkpoint.write_json(out / "metrics.json", _without_curves(record))
+    checkpoint.write_text(out / "report.html", report.page(record))
 
 
 def _tasks(options: Evaluate, the_robot: robot.Robot) -> tuple[str, ...]:
@@ -297,7 +318,7 @@ def _path(recorded: trace.Trace) -> dict[str, Any]:
     return found
 
 
-def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float) -> dict[str, Any]:
+def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float, label: str) -> dict[str, Any]:
     """Survival and ankle error while walking forward, over the levels of every disturbance."""
     from bipedtrack import suite
 
@@ -310,20 +331,23 @@ def _robustness(engines: Engines, who: Subject, options: Evaluate, weight: float
             recorded = engines.record("mujoco", batch, options.seconds, ladder.hooks(level, who.robot.timestep))
             summary = metrics.summarise(recorded, who.robot, weight)
             rows.append({"level": level, "survival": summary["survival"], "errors": summary["errors"]})
-            print(f"{name} {level:g} {ladder.unit}: {100 * summary['survival']['share']:.0f} % without a fall", flush=True)
+            print(
+                f"{label:<10} {name} {level:g} {ladder.unit}: {100 * summary['survival']['share']:.0f} % without a fall",
+                flush=True,
+            )
         found[name] = {"unit": ladder.unit, "levels": rows, "episodes": episodes, "task": "walk-forward"}
     return found
 
 
 def line(who: str, task: str, engine: str, summary: dict[str, Any]) -> str:
-    """One line of the table: survival, ankle and trunk errors, foothold error."""
+    """One line of the table: survival, ankle and trunk errors, foothold error. who: the policy's label."""
     errors, touchdown = summary["errors"], summary["touchdown"]
     ankles = [errors[f"{leg}_ankle_position_cm"]["mean"] for leg in robot.LEGS]
     yaws = [errors[f"{leg}_ankle_yaw_deg"]["mean"] for leg in robot.LEGS]
     worst = max(errors[f"{leg}_ankle_position_cm"]["p95"] for leg in robot.LEGS)
     foothold = touchdown["foothold_cm"]["mean"]
     return (
-        f"{pathlib.Path(who).stem:<10} {task:<20} {engine:<9} {100 * summary['survival']['share']:5.1f} % up"
+        f"{who:<10} {task:<20} {engine:<9} {100 * summary['survival']['share']:5.1f} % up"
         f"  ankles {np.mean(ankles):5.2f} cm (95 %: {worst:5.1f}) {np.mean(yaws):5.2f} deg"
         f"  trunk {errors['trunk_position_cm']['mean']:5.1f} cm {errors['trunk_orientation_deg']['mean']:5.1f} deg"
         + (f"  foothold {foothold:4.1f} cm" if foothold is not None else "")
@@ -343,16 +367,13 @@ def main() -> None:
     try:
         versions.require()
         _check(options)
-        record = run(options)
-        from bipedtrack import report, verdicts
-
-        record["verdicts"] = verdicts.verdicts(record)
-        checkpoint.write_json(options.out / "metrics.json", _without_curves(record))
-        page = options.out / "report.html"
-        checkpoint.write_text(page, report.page(record))
-        print(page)
+        run(options)
+        print(options.out / "report.html")
     except (Refusal, OSError) as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        print(f"\nbipedtrack: stopped; {options.out} holds the tasks that are done", file=sys.stderr)
+        sys.exit(130)
 
 
 def _check(options: Evaluate) -> None:
@@ -361,6 +382,10 @@ def _check(options: Evaluate) -> None:
         raise config.ConfigError("name at least one policy: a policy.npz, a run directory, ik or zero")
     if options.episodes < 1:
         raise config.ConfigError(f"--episodes {options.episodes}: must be at least 1")
+    if options.script is not None and options.tasks:
+        raise config.ConfigError("--script and --tasks: wanted one of them, a script takes the place of the tasks")
+    if not 0 <= options.seed < 2**63:
+        raise config.ConfigError(f"--seed {options.seed}: must lie in [0, 2^63)")
     if options.sway is not None and not 0 <= options.sway <= 1:
         raise config.ConfigError(f"--sway {options.sway}: must lie in [0, 1]")
     if not 0.1 <= options.seconds <= 600:

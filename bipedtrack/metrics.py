@@ -58,9 +58,10 @@ def summarise(
     - episodes, seconds: how many and how long the trace is.
     - errors: by `ERRORS` statistics over all entries before falls, pooled; and episode_mean, the mean over the means of
       the episodes, with its 95 % interval episode_low, episode_high (Student's t; None below three episodes).
-    - touchdown: planned (how many), undecided (not detected, the trace ends too soon; left out of missed_share),
-      missed_share; statistics step_length_cm, foothold_cm (in the plane), height_cm (positive: too high), yaw_deg, time_s
-      (negative: early), and for steps of more than 2 cm foothold_per_step, height_per_step (absolute), yaw_deg_per_m.
+    - touchdown: planned (how many; a foot that is to stay in the air has none), undecided (not detected, the trace ends too
+      soon; left out of missed_share), missed_share; statistics step_length_cm, foothold_cm (in the plane), height_cm
+      (positive: too high), yaw_deg, time_s (negative: early), and for steps of more than 2 cm foothold_per_step,
+      height_per_step (absolute), yaw_deg_per_m.
     - clearance (None without boxes), see `swings.clearances`: swings (that pass an edge), statistics edge_cm,
       below_edge_share of them; side_contact_share of all swings.
     - survival: share without a fall, its 95 % interval share_low, share_high (Wilson), falls, time_to_fall_mean_s of the
@@ -73,7 +74,7 @@ def summarise(
       trace: leading axes (episodes, n).
       robot: the constants of the robot.
       weight: its body weight, N.
-      boxes: stairs and obstacles, for the clearance.
+      boxes: stairs and obstacles, for the clearance, and for where feet are to land.
       contact_share: of the body weight, above which a foot counts as standing.
       settle: s to leave out of each rest.
 
@@ -84,7 +85,7 @@ def summarise(
     return {
         **outline(trace),
         "seconds": float(len(trace.time) * trace.timestep),
-        "touchdown": _summarise_touchdowns(trace, contact_share * weight),
+        "touchdown": _summarise_touchdowns(trace, contact_share * weight, robot, boxes),
         "clearance": None if boxes is None else _summarise_clearances(trace, robot, boxes),
         "rest": rest(trace, settle),
         "effort": effort(trace, robot.torque_limit),
@@ -202,8 +203,8 @@ def _check(trace: Trace) -> None:
                 raise ValueError(f"{name} is not finite before a fall")
 
 
-def _summarise_touchdowns(trace: Trace, threshold: float) -> dict[str, Any]:
-    found = swings.touchdowns(trace, threshold)
+def _summarise_touchdowns(trace: Trace, threshold: float, robot: Robot, boxes: swings.Boxes | None) -> dict[str, Any]:
+    found = swings.touchdowns(trace, threshold, robot, boxes)
     missed = found.pop("missed")
     summary: dict[str, Any] = {name: _statistics(values) for name, values in found.items()}
     undecided = int(np.isnan(missed).sum())

@@ -126,15 +126,15 @@ def _tree(value: Any) -> str:
 _DEFINITIONS = f"""<ul>
 <li><b>Error</b>: distance of a node from its real-time target of the same instant, at each control step before a fall, in
 cm; yaw of the ankles and whole rotation of the trunk, in deg. Mean, median, 95th percentile (95 %) and maximum are over all
-steps of all episodes; over time, the mean over the robots that have not fallen.</li>
+steps of all episodes, of a hold those before it, too; over time, the mean over the robots that have not fallen.</li>
 <li><b>Without a fall</b>: share of episodes that last to the end, with Wilson's 95 % interval. A fall is a trunk tilted by
 {math.degrees(falls.TILT):.0f} deg or {falls.DEPTH:g} m below its target, or an ankle {falls.LOST_ANKLE:g} m off its own.
 Time to fall: mean of those that fall; median of all, if more than half of them fall.</li>
 <li><b>Interval of an error</b>: of the mean over the means of the episodes, by Student's t.</li>
-<li><b>Footholds</b>: the ankle against its foothold at the planned instant, whether the foot is down or not. The time is
-when the ground first bears more than {100 * metrics.CONTACT_SHARE:g} % of the weight, from the middle of the swing to half
-a swing after its planned end; else the touchdown is missed. No error is divided by a step of
-{100 * swings.LEAST_STEP:g} cm or less.</li>
+<li><b>Footholds</b>: the ankle against its foothold at the planned instant, whether the foot is down or not; a foot that
+is to stay in the air has none. The time is when the ground first bears more than {100 * metrics.CONTACT_SHARE:g} % of the
+weight, from the middle of the swing to half a swing after its planned end; else the touchdown is missed. No error is
+divided by a step of {100 * swings.LEAST_STEP:g} cm or less.</li>
 <li><b>Clearance</b>: least height of a corner of the sole over the edge of a tread or obstacle as it passes that edge. A
 swing is against a side if a corner comes within {1000 * swings.SIDE_REACH:g} mm of it,
 {1000 * swings.SIDE_DEPTH:g} mm or more below its edge.</li>

@@ -14,6 +14,7 @@ from bipedtrack.robot import Robot
 from bipedtrack.trace import Trace
 
 LEAST_STEP = 0.02  # m: no error is divided by a shorter step
+IN_THE_AIR = 0.02  # m above what lies under it, from which a foot is meant to stay up
 SIDE_REACH = 0.012  # m: a sole touches with spheres of 0.01 m at its corners, so this near to a side they lie against it
 SIDE_DEPTH = 0.005  # m below the edge from which it is the side that is touched, not the top
 
@@ -66,14 +67,27 @@ def detect(trace: Trace, planned: Swings, threshold: float) -> tuple[np.ndarray,
     return found, (found >= 0) | (last < n) | ~trace.alive[planned.episode, -1]
 
 
-def touchdowns(trace: Trace, threshold: float) -> dict[str, np.ndarray]:
+def landing(trace: Trace, robot: Robot, boxes: Boxes | None) -> Swings:
+    """The `completed` swings that are to end on the ground or on a box: a foot may also be meant to stay in the air."""
+    planned = completed(trace)
+    soles = trace.target.ankle_positions[planned.episode, planned.touchdown, planned.foot] - [0, 0, robot.ankle_height]
+    above = soles[:, 2].astype(float)
+    for i in range(0 if boxes is None else boxes.yaws.shape[1]):
+        of_box = (part[planned.episode, i] for part in boxes or ())
+        outside, height = _beside(soles[:, None], *of_box)
+        under = (outside[:, 0] <= 0) & (height[:, 0] > -IN_THE_AIR)
+        above = np.where(under, np.minimum(above, height[:, 0]), above)
+    return Swings(*(part[above < IN_THE_AIR] for part in planned))
+
+
+def touchdowns(trace: Trace, threshold: float, robot: Robot, boxes: Boxes | None = None) -> dict[str, np.ndarray]:
     """What came of k planned touchdowns, (k,) each, with the ground felt from a normal force of more than `threshold` N.
 
     Errors are those at the planned instant, whether the foot was down or not. Keys as in `metrics.summarise` and
     step_length_cm, in the plane between the targets at lift-off and touchdown; values per step length are nan for steps of
     2 cm and less, time_s is nan where nothing was detected; missed is 1 or 0, and nan where the trace ends too soon to say.
     """
-    planned = completed(trace)
+    planned = landing(trace, robot, boxes)
     measured, decided = detect(trace, planned, threshold)
     at = planned.episode, planned.touchdown, planned.foot
     target, real = trace.target.ankle_positions[at].astype(float), trace.measured.ankle_positions[at].astype(float)

@@ -187,8 +187,8 @@ class Job:
 
 def _job(options: Train) -> Job:
     """The training to begin or to go on with, with as many devices as are wished for."""
-    if options.seed < 0:
-        raise config.ConfigError(f"--seed {options.seed}: must not be negative")
+    if not 0 <= options.seed < 2**63:
+        raise config.ConfigError(f"--seed {options.seed}: must lie in [0, 2^63)")
     if options.devices < 0:
         raise config.ConfigError(f"--devices {options.devices}: must not be negative")
     if options.resume:

@@ -6,6 +6,7 @@ import math
 import os
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -159,6 +160,9 @@ REFUSALS = {  # the arguments and a part of the line
     "ik --script bad.csv": "bad.csv:3: foot is 'middle'; wanted left, right, left up, right up, jump or both",
     "ik --episodes 0": "--episodes 0: must be at least 1",
     "sways.npz straight.npz": "(sways.npz with --sway 0.5, straight.npz with --sway 0); wanted one --sway for all of them",
+    "ik --script bad.csv --tasks stand": "--script and --tasks: wanted one of them",
+    "ik --seed -1": "--seed -1: must lie in [0, 2^63)",
+    "ik --seed 100000000000000000000": "--seed 100000000000000000000: must lie in [0, 2^63)",
     "ik --sway 1.5": "--sway 1.5: must lie in [0, 1]",
     "ik --seconds 0": "--seconds 0.0: must lie in [0.1, 600]",
     "ik --seconds nan": "--seconds nan: must lie in [0.1, 600]",
@@ -191,6 +195,7 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     # should it not be refused, it shall at least be short
     short = {"--tasks": "stand", "--episodes": "1", "--engine": "mujoco"}
     given = arguments.split()
+    short = short if "--script" not in given else {}
     given += [word for option, value in short.items() if option not in given for word in (option, value)]
     monkeypatch.setattr(sys, "argv", ["bipedtrack.evaluate", *given])
     with pytest.raises(SystemExit) as refusal:
@@ -207,6 +212,22 @@ def test_only_what_stands_on_the_ground_counts_for_the_clearance(robot: robots.R
     assert evaluate.boxes_of(batches["walk-forward"]) is None
     boxes = evaluate.boxes_of(batches["stairs-up"])
     assert boxes is not None and (boxes.centres[..., 2] + boxes.half_sizes[..., 2]).max() > 0.02
+
+
+def test_who_stops_it_keeps_what_is_done(tmp_path: pathlib.Path) -> None:
+    tasks = ("stand", "walk-forward", "sidle-left", "turn-left", "squat")
+    arguments = ["ik", "--engine", "converged", "--episodes", "1", "--seconds", "2", "--tasks", *tasks]
+    command = [sys.executable, "-m", "bipedtrack.evaluate", *arguments, "--out", str(tmp_path)]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+    with subprocess.Popen(command, **pipes) as running:
+        said = [running.stdout.readline() for _ in range(2)]  # type: ignore[union-attr]
+        running.send_signal(signal.SIGINT)
+        _, errors = running.communicate(timeout=PATIENCE)
+    assert running.returncode == 130 and errors.count("\n") <= 2 and f"{tmp_path} holds the tasks that are done" in errors
+    assert [line.split()[1] for line in said] == list(tasks[:2])
+    found = Run(130, said, errors, tmp_path)
+    assert 1 <= len(found.record["tasks"]) < len(tasks) and "stand" in found.record["tasks"]
+    assert "stand" in (tmp_path / "report.html").read_text()
 
 
 # Ablations
@@ -231,7 +252,8 @@ def test_feedback_ratio_0_is_ik(short: pathlib.Path, tmp_path: pathlib.Path) -> 
         assert effort[1]["feedback_mean"] > 0.01 > effort[0]["feedback_max"] == 0
         for figures in effort:
             del figures["feedback_mean"], figures["feedback_max"]
-        assert ablated[engine] == ik[engine]
+        of_each = [{name: part for name, part in one[engine].items() if name != "traces"} for one in (ik, ablated)]
+        assert of_each[0] == of_each[1]
     # curves and paths, which the report draws, are every tenth entry of what was recorded
     arrays = dict(np.load(tmp_path / "traces" / "1-best-mujoco-script-short-0.npz"))
     assert arrays["alive"].all() and len(arrays["time"]) == 80
@@ -350,16 +372,16 @@ def test_the_table_has_a_line_for_each_policy_and_engine(runs: Runs) -> None:
         (runs.zero, [("zero", "zero", engine) for engine in ENGINES], "walk-forward"),
         (
             runs.script,
-            [(name, pathlib.Path(name).stem, engine) for name in (str(FIRST), "silent/best.npz") for engine in ENGINES[1:]],
+            [(name, name, engine) for name in (str(FIRST), "silent/best.npz") for engine in ENGINES[1:]],
             "script-walk",
         ),
     ]
     for run, rows, task in expected:
         assert len(run.printed) == len(rows) + 1
-        for line, (name, stem, engine) in zip(run.printed, rows, strict=False):
+        for line, (name, label, engine) in zip(run.printed, rows, strict=False):
             found = LINE.fullmatch(line)
             assert found, line
-            assert found.groups()[:3] == (stem, task, engine)
+            assert found.groups()[:3] == (label, task, engine)  # whole paths where files are called the same
             summary = run.summary(task, name, engine)
             of = summary["errors"]
             ankles, yaws = ([of[f"{leg}_ankle_{what}"] for leg in ("left", "right")] for what in ("position_cm", "yaw_deg"))
@@ -407,7 +429,7 @@ def test_metrics_hold_tasks_policies_and_engines(runs: Runs) -> None:
     assert set(task["policies"]) == {str(FIRST)} and tuple(task["policies"][str(FIRST)]) == ENGINES
     for run in (runs.first, runs.zero):
         for found in next(iter(run.record["tasks"]["walk-forward"]["policies"].values())).values():
-            assert set(found) == {"summary", "levels"}
+            assert set(found) == {"summary", "levels", "traces"}
             assert found["summary"]["episodes"] == 2 and found["summary"]["seconds"] == pytest.approx(SECONDS)
             # two levels of one episode each
             shares = [level["survival"]["share"] for level in found["levels"]]
@@ -459,6 +481,10 @@ def test_errors_of_the_traces_are_those_of_the_summary(runs: Runs, mj_model: muj
     named = ((str(FIRST), "0-best"), ("silent/best.npz", "1-best"))
     groups += [(runs.script, name, "script-walk", stem, "mujoco", (0,)) for name, stem in named]
     left = {run.out.name: set(run.traces) for run in runs}
+    for run in runs:
+        (task,) = run.record["tasks"].values()
+        named = [file for engines in task["policies"].values() for found in engines.values() for file in found["traces"]]
+        assert sorted(named) == sorted(f"{name}.npz" for name in run.traces)
     for run, name, task, stem, engine, episodes in groups:
         pooled = []
         for episode in episodes:

@@ -43,10 +43,27 @@ def test_swings_of_a_script_end_on_its_footholds(robot: Robot) -> None:
     assert found.foot[order].tolist() == [0, 1, 1]
     assert found.liftoff[order].tolist() == [0, 100, 220]
     assert found.touchdown[order].tolist() == [100, 220, 300]
-    came = swings.touchdowns(trace, 20.0)
+    came = swings.touchdowns(trace, 20.0, robot)
     np.testing.assert_allclose(came["step_length_cm"][order], [20, 40, 10])
     np.testing.assert_allclose(came["foothold_cm"], 0, atol=1e-12)
     np.testing.assert_allclose(came["yaw_deg"], 0, atol=1e-12)
+
+
+def test_a_foot_that_is_to_stay_in_the_air_touches_nothing_down(robot: Robot) -> None:
+    header = ",".join(footsteps.COLUMNS)
+    rows = "left up,0,0.1,0.1,,0.5\nleft up,0.1,0.1,0.15,,0.5\nleft,0.1,0.1,,,0.5\nright,0.3,-0.1,,,0.5\nboth,,,,,0.5\n"
+    script = footsteps.parse(f"# box 0.3 -0.1 0 0.3 0.3 0.2 0.1\n{header}\n{rows}", robot, "kick.csv")
+    commands = list(footsteps.commands(script, DT))
+    trace = standing(n=len(commands))
+    target = Nodes(*(np.array(part)[None] for part in zip(*(c.target for c in commands), strict=True)))
+    trace = trace._replace(target=target, measured=target, timer=np.array([c.timer for c in commands])[None])
+    boxes = Boxes(np.array([[[0.3, -0.1, 0.05]]]), np.array([[[0.15, 0.1, 0.05]]]), np.array([[0.3]]))
+    assert len(swings.completed(trace).foot) == 4
+    assert swings.landing(trace, robot, boxes).foot.tolist() == [0, 1]  # the right one on the box
+    assert swings.landing(trace, robot, None).foot.tolist() == [0]
+    above = boxes._replace(centres=boxes.centres + [0, 0, 0.2])  # a box overhead bears nothing
+    assert swings.landing(trace, robot, above).foot.tolist() == [0]
+    assert summary(trace, robot, boxes=boxes)["touchdown"]["planned"] == 2
 
 
 LOADED, LIGHT = 25.0, 20.0  # N: more than 5 % of the weight, and just not more
@@ -129,7 +146,8 @@ def test_touchdown_errors_worked_by_hand(robot: Robot) -> None:
     trace.measured.ankle_yaws[0, 60, 1] = math.radians(-177)
     swing(trace, 80, 120, foot=0, episode=1)  # steps on the spot, lands 1 cm off
     trace.measured.ankle_positions[1, 120, 0, 0] = 0.01
-    found = summary(trace, robot)["touchdown"]
+    block = Boxes(np.full((2, 1, 3), [0.3, 0.3, 0.05]), np.full((2, 1, 3), [0.1, 0.1, 0.05]), np.zeros((2, 1)))
+    found = summary(trace, robot, boxes=block)["touchdown"]
     assert found["foothold_cm"] == pytest.approx(
         {"mean": 3, "rms": math.sqrt(13), "median": 3, "p5": 1.2, "p95": 4.8, "min": 1, "max": 5}
     )
