@@ -11,13 +11,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import brax.envs
 import jax
 import jax.numpy as jnp
 import measure
-import tyro
 
 from bipedtrack import curriculum, observation, training
+from bipedtrack.messages import quiet_imports
+
+with quiet_imports():
+    import brax.envs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +77,8 @@ def products(network: curriculum.NetworkConfig, epochs: int) -> float:
 
 
 def main(options: Learner) -> None:
-    """Prints one line."""
+    """Prints one line. Raises Refusal for options that cannot be."""
+    measure.require_positive(updates=options.updates)
     config = curriculum.load(options.curriculum)
     measure.use_devices(options.devices, config.ppo.shares_out)
     rate, compiling = training.speed(config, curriculum.calls(config)[0], Constant(), options.updates)
@@ -86,4 +89,4 @@ def main(options: Learner) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Learner))
+    measure.run(main, Learner)

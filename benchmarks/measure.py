@@ -5,29 +5,53 @@ from __future__ import annotations
 import json
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import tyro
 
 from bipedtrack import train
+from bipedtrack.messages import Refusal, fail, quiet_imports
+
+with quiet_imports():  # nothing but JSON lines is printed
+    from mujoco import mjx  # noqa: F401
+
+Options = TypeVar("Options")
+
+
+def run(main: Callable[[Options], None], options: type[Options]) -> None:
+    """A benchmark's command line: what its options refuse is one line and exit status 2."""
+    try:
+        main(tyro.cli(options))
+    except (Refusal, OSError) as error:
+        fail(str(error))
+
+
+def require_positive(**numbers: int) -> None:
+    """Raises Refusal for the first of some options that is not at least 1."""
+    for name, number in numbers.items():
+        if number < 1:
+            raise Refusal(f"--{name} {number}: must be at least 1")
 
 
 def use_devices(count: int, shares_out: Callable[[int], bool]) -> int:
     """Makes the CPU count as so many devices, 0: as many as there are cores, or the most of them that share the work evenly.
 
-    Returns how many local devices there are. Must come before anything else of JAX.
+    Returns how many local devices there are. Must come before anything else of JAX. Raises Refusal where the work cannot be
+    shared out.
 
     shares_out: whether a number of devices shares the work evenly.
     """
+    if count < 0:
+        raise Refusal(f"--devices {count}: must not be negative")
     count = count or next(count for count in range(train.cores(), 0, -1) if shares_out(count))
     jax.config.update("jax_num_cpu_devices", count)
     found = jax.local_device_count()
     if not shares_out(found):
-        sys.exit(f"{found} devices: the robots cannot be shared out evenly; wanted another number of devices or of robots")
+        raise Refusal(f"{found} devices: the robots cannot be shared out evenly; wanted another number of devices or robots")
     return found
 
 

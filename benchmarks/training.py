@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import dataclasses
 
-import brax.envs
-import brax.envs.wrappers.training
 import measure
 import rollout
-import tyro
 
 from bipedtrack import autoreset, curriculum, policy, training
+from bipedtrack.messages import Refusal, quiet_imports
+
+with quiet_imports():
+    import brax.envs
+    import brax.envs.wrappers.training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,8 +41,11 @@ class Training:
 
 
 def main(options: Training) -> None:
-    """Prints a line for the lesson, and one for the peer."""
+    """Prints a line for the lesson, and one for the peer. Raises Refusal for options that cannot be."""
+    measure.require_positive(updates=options.updates)
     config = curriculum.load(options.curriculum)
+    if not 0 <= options.stage < len(config.stages):
+        raise Refusal(f"--stage {options.stage}: {options.curriculum} has the stages 0 to {len(config.stages) - 1}")
     devices = measure.use_devices(options.devices, config.ppo.shares_out)
     stage = config.stages[options.stage]
     call = next(call for call in curriculum.calls(config) if call.stage is stage)
@@ -69,4 +74,4 @@ def main(options: Training) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Training))
+    measure.run(main, Training)
