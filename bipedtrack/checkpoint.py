@@ -178,7 +178,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Puts `content` at `path`, whole or not at all, even if the power fails. Raises RunError when it cannot be written."""
-    path = Path(path)
+    path = Path(os.path.realpath(path))  # a link stays one, and leads to the new content
     with os_errors(path, "written"):
         unfinished = _beside(path)
         try:
@@ -206,9 +206,11 @@ def require_writable(path: str | Path) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """Where a file is written before it is moved to its place. Raises OSError where that is a folder."""
+    """Where a file is written before it is moved to its place. Raises OSError where that is a folder, a device or a pipe."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "it is a folder; wanted the name of a file")
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is a device or a pipe; wanted the name of a file")
     return path.absolute().with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
 
 

@@ -165,7 +165,9 @@ class Curriculum:
         if not 0 < self.policy_period <= self.episode_seconds:
             raise ValueError("policy_period must be positive and no longer than episode_seconds")
         for stage in self.stages:
-            most = terrain.TREADS_DOWN * ranges_of(self, stage).period[0]
+            # the table at the end draws from the curriculum's own ranges
+            shortest = min(ranges_of(self, stage).period[0], self.ranges.period[0])
+            most = terrain.TREADS_DOWN * shortest
             if stage.shares.stairs > 0 and self.episode_seconds > most:
                 raise ValueError(
                     f"episode_seconds ({self.episode_seconds:g}) must be at most {most:g} in stage {stage.name!r}: "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import json
+import math
 import pathlib
 from typing import Annotated, Any
 
@@ -60,10 +61,12 @@ def read(run: pathlib.Path, smooth: int = 1) -> dict[str, np.ndarray]:
     try:
         whole, _, _ = file.read_text(encoding="utf-8").rpartition("\n")  # after a power cut the last line may be cut off
         records = [json.loads(line) for line in whole.splitlines()]
-        rows = [[float("nan" if r[name] is None else r[name]) for name in ("steps", *PANELS)] for r in records]
+        rows = [[float(r["steps"]), *(float("nan" if r[name] is None else r[name]) for name in PANELS)] for r in records]
+        if not all(0 <= row[0] < math.inf for row in rows) or any(math.inf in map(abs, row) for row in rows):
+            raise ValueError("steps or figures are no numbers")
     except OSError as error:
         raise Refusal(f"{file}: cannot be read ({error.strerror or error}); wanted a run directory") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise Refusal(f"{file}: is damaged ({type(error).__name__}: {error}); wanted the records of a training") from None
     if not rows:
         raise Refusal(f"{file}: has no record yet; wait for the first epochs of the training")
@@ -85,7 +88,7 @@ def _smoothed(values: np.ndarray, count: int) -> np.ndarray:
 
 def picture(curves: dict[str, dict[str, np.ndarray]]) -> str:
     """An SVG file of one panel for each of PANELS with a curve for each run, by its name."""
-    longest = max(run["steps"][-1] for run in curves.values()) / 1e6
+    longest = max(1.0, *(run["steps"][-1] for run in curves.values())) / 1e6
     size = f"0 0 {2 * _WIDTH} {_KEY + 2 * _HEIGHT}"
     parts = [f"<style>{markup.CSS}</style>", f'<rect width="{2 * _WIDTH}" height="{_KEY + 2 * _HEIGHT}" fill="#fff"/>']
     for i, name in enumerate(curves):

@@ -141,6 +141,15 @@ def from_first(name: str, give: Callable[[], Any], process: Process) -> Any:
     return json.loads(text)
 
 
+def require_same(name: str, number: int, process: Process) -> None:
+    """Raises DistributedError where a number is not the first process's, as all must have it. Each name serves once."""
+    first = from_first(name, lambda: number, process)
+    if number != first:
+        raise DistributedError(
+            f"{process}: has {number} {name}, the first one {first}; wanted --{name} {min(number, first)}"
+        )
+
+
 def share_arrays(arrays: Any, process: Process) -> Any:
     """The tree of arrays that the first process gives; the others give one of the same shapes."""
     if process.count == 1:

@@ -23,10 +23,10 @@ class Export:
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
     """The run directory; or a policy file, for --onnx."""
-    out: pathlib.Path = pathlib.Path("policy.npz")
-    """The file to write."""
+    out: pathlib.Path | None = None
+    """The file to write. Default: policy.npz, or none beside --onnx."""
     onnx: pathlib.Path | None = None
-    """Also an ONNX graph from observation to feedback, to write here (needs `pip install '.[onnx]'`)."""
+    """An ONNX graph from observation to feedback, to write here (needs `pip install '.[onnx]'`)."""
 
 
 def main() -> None:
@@ -39,10 +39,14 @@ def main() -> None:
         if options.run.is_file():
             if options.onnx is None:
                 raise policy.PolicyError(f"{options.run}: is a file; wanted a run directory, or --onnx with a policy file")
+            if options.out is not None:
+                raise policy.PolicyError(f"--out {options.out}: {options.run} is a policy file already; wanted --onnx alone")
             written = policy.load(options.run)
         else:
-            written = export(options.run, options.out)
-            print(options.out)
+            out = options.out or (pathlib.Path("policy.npz") if options.onnx is None else None)
+            written = export(options.run, out)
+            if out is not None:
+                print(out)
         if options.onnx is not None:
             onnx_export.save(written, options.onnx)
             print(options.onnx)
@@ -50,8 +54,8 @@ def main() -> None:
         fail(str(error))
 
 
-def export(run: pathlib.Path, out: pathlib.Path) -> policy.Policy:
-    """Writes the policy of the run's newest intact checkpoint and returns it.
+def export(run: pathlib.Path, out: pathlib.Path | None) -> policy.Policy:
+    """The policy of the run's newest intact checkpoint, written to `out` where there is one.
 
     Raises checkpoint.RunError or checkpoint.CheckpointError where the run or its checkpoint cannot be read.
     """
@@ -59,7 +63,9 @@ def export(run: pathlib.Path, out: pathlib.Path) -> policy.Policy:
         from bipedtrack import training
 
     directory = RunDirectory(run)
-    newest = training.save_policy(directory, out)
+    newest = training.newest_policy(directory)
+    if out is not None:
+        policy.save(newest, out)
     for warning in directory.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return newest

@@ -17,5 +17,6 @@ def quiet_imports() -> contextlib.redirect_stdout[io.StringIO]:
 
 def fail(message: str) -> NoReturn:
     """Prints the message on stderr, each line under the program's name, and exits with status 2."""
-    print(f"bipedtrack: {message}", file=sys.stderr)
+    for line in message.splitlines() or [""]:
+        print(f"bipedtrack: {line}", file=sys.stderr)
     sys.exit(2)

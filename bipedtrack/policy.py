@@ -196,6 +196,10 @@ def _check(policy: Policy) -> None:
         kinds = (np.float32, np.float64) if name.startswith("robot/") else (np.float32,)
         if array.dtype not in kinds or not np.isfinite(array).all():
             raise PolicyError(f"array {name} is {array.dtype} or not finite; wanted finite {kinds[-1].__name__} numbers")
+    if not isinstance(robot.name, str) or not all(isinstance(name, str) for name in robot.joint_names):
+        raise PolicyError("the names of the robot and its joints must be text")
+    if not isinstance(policy.provenance, dict):
+        raise PolicyError(f"provenance must be a table, not {policy.provenance!r}")
     if len(robot.joint_names) != 12 or not network.weights or sizes[-1] != 12:
         raise PolicyError(f"the network gives {sizes[-1]} numbers; wanted one for each of {len(robot.joint_names)} joints")
     if policy.activation not in ACTIVATIONS:
@@ -212,6 +216,11 @@ def _check(policy: Policy) -> None:
         value = getattr(robot, name)
         if not (isinstance(value, float) and 0 < value < math.inf):
             raise PolicyError(f"the robot's {name} must be a positive number, not {value!r}")
+    for name in ("kp", "kd", "torque_limit", "masses", "leg_length"):
+        if not (getattr(robot, name) > 0).all():
+            raise PolicyError(f"the robot's {name} must be positive")
+    if not robot.leg_length[0] < robot.leg_length[1]:
+        raise PolicyError("the robot's leg_length must be the least and the greatest")
     if not (robot.joint_low < robot.joint_high).all():
         raise PolicyError("the robot's joint_low must lie below joint_high")
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import pathlib
 import time
 from types import TracebackType
@@ -10,7 +12,9 @@ import rich.console
 import rich.live
 import rich.table
 import rich.text
-import tensorboardX
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.summary import scalar
 
 from bipedtrack import checkpoint
 from bipedtrack.curriculum import Call, Curriculum
@@ -33,10 +37,12 @@ class Progress:
         self._done = done_steps  # before the present call
         self._console = rich.console.Console()
         self._live = rich.live.Live(console=self._console, auto_refresh=False, transient=False)
-        self._writer = tensorboardX.SummaryWriter(str(folder / "tensorboard"))
+        self._events = _Events(folder / "tensorboard")
         self._spoke = 0.0
         self._rate = 0.0  # policy steps/s, smoothed
         self._last = (time.monotonic(), 0)
+        self._began: float | None = None  # when the present call was announced, until its first update
+        self._first = (0.0, 0)  # s from there to the first update of a call, and its policy steps
 
     def __enter__(self) -> Progress:
         if self._console.is_terminal:
@@ -46,7 +52,7 @@ class Progress:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._console.is_terminal:
             self._live.stop()
-        self._writer.close()
+        self._events.close()
 
     def say(self, text: str) -> None:
         """Prints a line beside the live display."""
@@ -54,7 +60,8 @@ class Progress:
 
     def compiling(self, call: Call, what: str) -> None:
         """Announces that a call's program is being compiled, which takes a while and shows nothing else."""
-        self._last = (time.monotonic(), 0)
+        now = time.monotonic()
+        self._last, self._began = (now, 0), self._began or now
         self._show(call, 0, {}, f"compiling {what}")
 
     def update(self, call: Call, steps: int, figures: dict[str, float]) -> None:
@@ -64,23 +71,34 @@ class Progress:
         if self._last[1] > 0 and seconds > 0:
             rate = advanced / seconds
             self._rate = rate if self._rate == 0 else 0.8 * self._rate + 0.2 * rate
+        if self._began is not None:
+            self._first, self._began = (now - self._began, steps), None
         self._last = (now, steps)
         step = self._done + steps
         record = {"stage": call.stage.name, "lesson": call.lesson.name, "call": call.index, "steps": step}
         record |= {"time": round(time.time(), 1), "steps_per_second": round(self._rate, 1), **figures}
         checkpoint.append_jsonl(self._folder / "progress.jsonl", record)
-        for name, value in figures.items():
-            self._writer.add_scalar(name, value, step)
-        self._writer.flush()
+        self._warn(self._events.add(step, figures))
         self._show(call, steps, figures, "training")
 
     def finished(self, call: Call) -> None:
         """Counts a finished call."""
         self._done += call.steps
 
+    def _warn(self, problem: str) -> None:
+        if problem:
+            self.say(f"warning: {problem}; goes on without")
+
+    def _minutes_left(self, call: Call, step: int) -> float:
+        """Of the steps that are left at the present speed, and of beginning the calls that are left as the last one did."""
+        seconds, steps = self._first
+        to_begin = max(0.0, seconds - steps / self._rate)
+        calls_left = len(self._calls) - 1 - call.index
+        return (max(self._total - step, 0) / self._rate + calls_left * to_begin) / 60
+
     def _show(self, call: Call, steps: int, figures: dict[str, float], doing: str) -> None:
         step = self._done + steps
-        left = f"{max(self._total - step, 0) / self._rate / 60:.0f} min left" if self._rate else ""
+        left = f"{self._minutes_left(call, step):.0f} min left" if self._rate else ""
         shown = {
             "stage": f"{call.stage.name}, {call.lesson.name} (call {call.index + 1} of {len(self._calls)})",
             "doing": doing,
@@ -102,6 +120,38 @@ class Progress:
         elif doing != "training" or time.monotonic() - self._spoke > _LINE_EVERY:
             self._spoke = time.monotonic()
             self.say(" | ".join(text.strip() for text in shown.values() if text.strip()))
+
+
+class _Events:
+    """Scalars for TensorBoard, written at once. What cannot be written ends no training: then nothing more is."""
+
+    def __init__(self, folder: pathlib.Path):
+        self._folder = folder
+        self._writer: EventsWriter | None = None
+        self._given_up = False
+
+    def add(self, step: int, figures: dict[str, float]) -> str:
+        """Writes figures at a policy step; why that was not possible, once, or nothing."""
+        if self._given_up:
+            return ""
+        try:
+            if self._writer is None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                # named by the second and the process: a run that is gone on with begins another file
+                self._writer = EventsWriter(str(self._folder / "events"), f".{os.getpid()}")
+            for name, value in figures.items():
+                self._writer.write_event(Event(wall_time=time.time(), step=step, summary=scalar(name, value)))
+            self._writer.flush()
+        except OSError as error:
+            self._given_up = True
+            return f"{self._folder}: cannot be written ({error.strerror or error})"
+        return ""
+
+    def close(self) -> None:
+        """Ends the file."""
+        if self._writer is not None:
+            with contextlib.suppress(OSError):  # what is not written by now has been warned of
+                self._writer.close()
 
 
 class Aside:

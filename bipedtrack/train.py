@@ -16,7 +16,19 @@ from typing import Any, Literal, NoReturn
 
 import tyro
 
-from bipedtrack import checkpoint, compilation, config, control, curriculum, distributed, robot, symmetry, versions
+from bipedtrack import (
+    __version__,
+    checkpoint,
+    compilation,
+    config,
+    control,
+    curriculum,
+    distributed,
+    policy,
+    robot,
+    symmetry,
+    versions,
+)
 from bipedtrack.curriculum import Curriculum
 from bipedtrack.distributed import ALONE, Process
 from bipedtrack.messages import Refusal, fail, quiet_imports
@@ -70,11 +82,14 @@ def main() -> None:
 
 
 def _run_or_fail(options: Train, process: Process) -> None:
-    """Trains, or says in one line on stderr what was wrong and exits with status 2."""
+    """Trains, or says in one line on stderr what was wrong and exits with status 2; 130 where it was interrupted."""
     try:
         run(options, process)
     except Refusal as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        print(f"\nbipedtrack: interrupted; --resume goes on, from what is in {_folder(options)}", file=sys.stderr)
+        sys.exit(130)
 
 
 def _run_among_others(options: Train, process: Process) -> NoReturn:
@@ -128,6 +143,8 @@ def use_devices(device: str, count: int, ppo: curriculum.PpoConfig, process: Pro
     count = count or len(found)
     if count > len(found):
         raise DeviceError(f"--devices {count}: there are {len(found)} of kind {found[0].device_kind}")
+    if count < len(found) and process.count > 1:
+        raise DeviceError(f"--devices {count}: each of several processes uses all of its devices, here {len(found)}")
     if not ppo.shares_out(count * process.count):
         processes = f" of {process.count} processes" if process.count > 1 else ""
         raise config.ConfigError(
@@ -156,6 +173,7 @@ def run(options: Train, process: Process) -> None:
     job = Job(**distributed.from_first("job", lambda: dataclasses.asdict(_job(options)), process))
     plan = job.plan
     devices, description = use_devices(options.device, job.devices, plan.ppo, process)
+    distributed.require_same("devices", devices, process)
     job = dataclasses.replace(job, devices=devices)
     with contextlib.ExitStack() as stack:
         opened: list[RunDirectory] = []
@@ -265,7 +283,8 @@ def _circumstances(process: Process) -> dict[str, Any]:
     import jax
 
     kind = jax.local_devices()[0].device_kind
-    return {"device": kind, "processes": process.count, "versions": {row.name: row.found for row in versions.check()}}
+    found = {"bipedtrack": __version__, **{row.name: row.found for row in versions.check()}}
+    return {"device": kind, "processes": process.count, "versions": found}
 
 
 def _changes(began: dict[str, Any], job: Job, process: Process) -> list[str]:
@@ -274,7 +293,7 @@ def _changes(began: dict[str, Any], job: Job, process: Process) -> list[str]:
     began = {"devices": 1, **began}  # as `curriculum.of_run` has it
     found = [(name, began.get(name, now[name]), now[name]) for name in ("device", "devices", "processes")]
     before = began.get("versions", now["versions"])
-    found += [(name, before.get(name), version) for name, version in now["versions"].items()]
+    found += [(name, before.get(name, version), version) for name, version in now["versions"].items()]
     return [f"the run began with {name} {old}, and goes on with {new}" for name, old, new in found if old != new]
 
 
@@ -306,12 +325,14 @@ def _train(directory: RunDirectory, job: Job, description: str, process: Process
             progress.say(
                 f"stopped; {0 if saved is None else saved.call + 1} of {len(calls)} calls are saved. Go on with:\n"
                 f"  python -m bipedtrack.train --resume --out {shlex.quote(str(directory.path))}"
+                + (f", in all {process.count} processes as before" if process.count > 1 else "")
             )
             sys.exit(130)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     path = directory.path / "policy.npz"
-    trained = training.save_policy(directory, path)
+    trained = training.newest_policy(directory)
+    policy.save(trained, path)
     console = rich.console.Console()
     if plan.evaluation_episodes:
         _show_table(directory, plan, trained, console)
@@ -351,6 +372,8 @@ def _stop_on_signals() -> Any:
     def ask(number: int, frame: Any) -> None:
         asked.append(number)
         signal.signal(number, signal.SIG_DFL)
+        if sys.stdout.isatty():
+            print("\x1b[?25h", end="", flush=True)  # the cursor, which the live display hides, should a second one come
         print("\nstopping after the present updates; the last finished call is saved", file=sys.stderr)
 
     signal.signal(signal.SIGINT, ask)

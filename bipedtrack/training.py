@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import pathlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -237,8 +236,8 @@ def _figures(metrics: dict[str, Any], policy_period: float) -> dict[str, float]:
     }
 
 
-def save_policy(run: RunDirectory, path: str | pathlib.Path) -> policy.Policy:
-    """Writes the policy of a run's newest intact checkpoint to `path` and returns it.
+def newest_policy(run: RunDirectory) -> policy.Policy:
+    """The policy of a run's newest intact checkpoint.
 
     Raises RunError, ConfigError or CheckpointError where the run or its checkpoint cannot be read.
     """
@@ -246,9 +245,7 @@ def save_policy(run: RunDirectory, path: str | pathlib.Path) -> policy.Policy:
     found = run.latest()
     if found is None:
         raise CheckpointError(f"{run.path}: has no checkpoint yet; its first PPO call is not finished")
-    newest = networks.to_policy(config, found.arrays, found.provenance, found.call)
-    policy.save(newest, path)
-    return newest
+    return networks.to_policy(config, found.arrays, found.provenance, found.call)
 
 
 def origin_of(found: Checkpoint) -> dict[str, Any] | None:

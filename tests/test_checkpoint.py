@@ -20,6 +20,7 @@ from bipedtrack.checkpoint import (
     RunError,
     append_jsonl,
     load_arrays,
+    require_writable,
     save_arrays,
     write_json,
     write_text,
@@ -347,6 +348,24 @@ def test_a_disk_without_any_space(tmp_path):
     (tmp_path / "progress.jsonl").symlink_to("/dev/full")
     with pytest.raises(RunError, match="progress.jsonl: cannot be written: No space left on device"):
         append_jsonl(tmp_path / "progress.jsonl", {})
+
+
+def test_a_device_or_a_pipe_is_no_file_to_write(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", "/dev/null"):
+        with pytest.raises(RunError, match="cannot be written: it is a device or a pipe; wanted the name of a file"):
+            write_text(place, "text")
+        with pytest.raises(RunError, match="it is a device or a pipe"):
+            require_writable(place)
+    assert (tmp_path / "pipe").is_fifo() and not os.path.isfile("/dev/null")
+
+
+def test_a_link_stays_one_and_leads_to_the_new_text(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("folder/file")
+    for text in ("new", "newer"):
+        write_text(tmp_path / "link", text)
+        assert (tmp_path / "link").is_symlink() and (tmp_path / "folder" / "file").read_text() == text
 
 
 @pytest.mark.parametrize("name", [".", "folder", "folder/"])

@@ -183,6 +183,10 @@ ADDED = [  # what is put in front, and the line it gives
         "episode_seconds = 12.5\n",
         "episode_seconds (12.5) must be at most 12 in stage 'hold': a staircase down has 30 treads",
     ),
+    (
+        "episode_seconds = 10\n[ranges]\nperiod = [0.2, 0.3, 0.5]\n",
+        "episode_seconds (10) must be at most 6 in stage 'hold': a staircase down has 30 treads",
+    ),
     ("evaluation_episodes = -1\n", "evaluation_episodes must not be negative"),
     ("policy_period = nan\n", "policy_period: nan (float) does not fit; wanted a finite number"),
     ("stage = 1\n", "stage: unknown key; did you mean 'stages'?"),

@@ -1,6 +1,7 @@
 """Learning curves: what is read of a run, and where it is drawn."""
 
 import json
+import math
 import pathlib
 import re
 import sys
@@ -58,6 +59,10 @@ def test_curves_are_drawn_where_their_figures_are(tmp_path: pathlib.Path) -> Non
     np.testing.assert_allclose(points[:, 1], height * (1 - np.array([20, 40, 0]) / 42), atol=0.06)
 
 
+def test_a_run_that_has_just_begun_is_drawn(tmp_path: pathlib.Path) -> None:
+    ElementTree.fromstring(curves.picture({"run": curves.read(run_of(tmp_path / "run", {"steps": 0}))}))
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -66,6 +71,10 @@ def test_curves_are_drawn_where_their_figures_are(tmp_path: pathlib.Path) -> Non
         ('{"steps": 1\n', "is damaged"),
         ('{"steps": 1}\n', "is damaged (KeyError: 'falls')"),
         ("3\n", "is damaged"),
+        ("[" * 100_000 + "\n", "is damaged"),
+        (json.dumps({"steps": None, **FIGURES}) + "\n", "is damaged (TypeError: "),
+        (json.dumps({"steps": -1, **FIGURES}) + "\n", "is damaged (ValueError: steps or figures are no numbers)"),
+        (json.dumps({"steps": 1, **FIGURES, "falls": math.inf}) + "\n", "is damaged (ValueError: steps or figures"),
     ],
 )
 def test_what_is_no_run_is_refused_in_one_line(tmp_path: pathlib.Path, content: str | None, words: str) -> None:

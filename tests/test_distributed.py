@@ -13,7 +13,7 @@ import pytest
 from ports import free_port
 
 import bipedtrack
-from bipedtrack import checkpoint, distributed
+from bipedtrack import checkpoint, distributed, train
 from bipedtrack.distributed import ALONE, DistributedError, Process
 
 ROOT = pathlib.Path(bipedtrack.__file__).parents[1]
@@ -67,6 +67,19 @@ def test_when_the_first_process_refuses_so_do_the_others(tmp_path: pathlib.Path)
     assert [process.returncode for process in both] == [2, 2]
     assert "no curriculum named 'nowhere'" in first and "process 1 of 2: the first process refused" in second
     assert first.count("\n") == second.count("\n") == 1
+
+
+@pytest.mark.skipif(train.cores() < 2, reason="one core is always one device")
+def test_processes_with_different_numbers_of_devices_are_refused(tmp_path: pathlib.Path) -> None:
+    smoke = (ROOT / "curricula" / "smoke.toml").read_text()
+    (tmp_path / "wide.toml").write_text(smoke.replace("num_envs = 8", "num_envs = 800"))
+    first, second = (start(tmp_path, i, port, "--curriculum", "../wide.toml") for port in [free_port()] for i in (0, 1))
+    os.sched_setaffinity(second.pid, {min(os.sched_getaffinity(0))})  # long before it has imported what looks at them
+    _, error = second.communicate(timeout=PATIENCE)
+    first.kill()
+    first.communicate()
+    assert second.returncode == 2, error
+    assert error == "bipedtrack: process 1 of 2: has 1 devices, the first one 2; wanted --devices 1\n"
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,8 @@ def test_onnx_is_written_beside_the_policy_and_from_a_policy_file(exported, tmp_
     graphs = []
     for source in (run, policy_file):
         graphs.append(tmp_path / f"{source.name}.onnx")
-        arguments = [str(source), "--out", str(tmp_path / "again.npz"), "--onnx", str(graphs[-1])]
+        out = ["--out", str(tmp_path / "again.npz")] if source is run else []
+        arguments = [str(source), *out, "--onnx", str(graphs[-1])]
         monkeypatch.setattr(sys, "argv", ["bipedtrack.export", *arguments])
         export.main()
         assert capsys.readouterr().out.splitlines()[-1] == str(graphs[-1])
@@ -144,8 +145,18 @@ def test_onnx_is_written_beside_the_policy_and_from_a_policy_file(exported, tmp_
     np.testing.assert_allclose(feedback, wanted, atol=1e-5)
 
 
+def test_onnx_alone_leaves_other_policies_alone(exported, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "policy.npz").write_text("mine")
+    monkeypatch.setattr(sys, "argv", ["bipedtrack.export", str(exported[0]), "--onnx", "policy.onnx"])
+    export.main()
+    assert capsys.readouterr().out == "policy.onnx\n" and (tmp_path / "policy.npz").read_text() == "mine"
+
+
 def test_a_policy_file_has_nothing_to_export_but_onnx(exported, refused, tmp_path):
     assert "is a file; wanted a run directory, or --onnx" in refused(exported[2])
+    again = refused(exported[2], "--onnx", tmp_path / "policy.onnx", "--out", tmp_path / "again.npz")
+    assert "is a policy file already; wanted --onnx alone" in again and not list(tmp_path.iterdir())
     assert "cannot be written" in refused(exported[2], "--onnx", tmp_path / "missing" / "policy.onnx")
 
 

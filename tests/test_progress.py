@@ -145,6 +145,50 @@ def test_time_left_is_the_rest_of_all_calls_at_the_present_speed(
     assert f"of {total / 1e6:.2f} M" in second
 
 
+def test_time_left_counts_what_the_calls_that_are_left_need_to_begin(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, clock: Clock
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_EVERY", -1.0)
+    plan = curriculum.load("quick")
+    calls = curriculum.calls(plan)
+    total = sum(call.steps for call in calls)
+    with Progress(tmp_path, plan, calls, 0) as shown:
+        shown.compiling(calls[0], "the environment")
+        clock.now += 10.0
+        shown.compiling(calls[0], "the learner")
+        clock.now += 30.0
+        shown.update(calls[0], 1000, FIGURES)
+        clock.now += 0.5
+        shown.update(calls[0], 2000, FIGURES)
+    # 2000 steps/s; of 40 s the first 1000 steps took half a second
+    minutes = ((total - 2000) / 2000 + (len(calls) - 1) * 39.5) / 60
+    assert float(re.search(r"(\d+) min left", capsys.readouterr().out.splitlines()[-1])[1]) == round(minutes)
+
+
+def test_a_training_goes_on_where_tensorboard_has_no_place(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tensorboard").write_text("a file")
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        for steps in (20, 40, 60):
+            shown.update(CALLS[0], steps, FIGURES)
+    assert len(lines(tmp_path)) == 3
+    assert capsys.readouterr().out.count("tensorboard: cannot be written (File exists); goes on without") == 1
+
+
+def test_a_training_goes_on_where_the_disk_becomes_full(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Progress(tmp_path, PLAN, CALLS, 0) as shown:
+        shown.update(CALLS[0], 20, FIGURES)
+        recorder = shown._events._writer._py_recordio_writer  # type: ignore[union-attr]
+        recorder._writer = open("/dev/full", "wb")
+        for steps in (40, 60):
+            shown.update(CALLS[0], steps, FIGURES)
+    assert len(lines(tmp_path)) == 3
+    assert capsys.readouterr().out.count("No space left on device); goes on without") == 1
+
+
 def test_lines_come_no_oftener_than_they_should(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Progress(tmp_path, PLAN, CALLS, 0) as shown:
         shown.compiling(CALLS[0], "the learner")
