@@ -147,23 +147,39 @@ def forward(robot: Robot, joints: Array) -> tuple[Array, Array]:
 
 
 def level_feet(robot: Robot, joints: Array, trunk_orientation: Array) -> Array:
-    """The joint angles (12,), rad, with the ankles turned so that the soles are level in the world, not in F_B.
+    """The joint angles (12,), rad, of the same ankles and headings with soles that are level in the world, not in F_B.
 
-    Where the trunk is level this changes nothing; where it is tilted, eq (1) would tilt the feet with it. The ankles'
-    positions stay; angles are clamped to the joints' ranges.
+    Where the trunk is level this changes nothing; where it is tilted, eq (1) would tilt the feet with it. It is `inverse`
+    in the foot's frame, which is now level in the world; the hip's axes turn the thigh as that asks for. A heading is that
+    of the foot's x axis on the ground. Angles are clamped to the joints' ranges.
     """
     xp = namespace(joints)
-    q = joints.reshape(2, 6)
-    up = rotations.to_matrix(trunk_orientation)[2]  # the world's vertical in F_B
-    s0, c0, s1, c1 = xp.sin(q[:, 0]), xp.cos(q[:, 0]), xp.sin(q[:, 1]), xp.cos(q[:, 1])
-    pitch = q[:, 2] + q[:, 3]
-    # the vertical in the shank's frame: Ry(-pitch) Rx(-q1) Rz(-q0) up
-    x, y = c0 * up[0] + s0 * up[1], c0 * up[1] - s0 * up[0]
-    y, z = c1 * y + s1 * up[2], c1 * up[2] - s1 * y
-    x, z = xp.cos(pitch) * x - xp.sin(pitch) * z, xp.sin(pitch) * x + xp.cos(pitch) * z
-    ankles = xp.stack([xp.atan2(x, z), -xp.asin(xp.clip(y, -1.0, 1.0))], axis=-1)
-    low, high = (xp.asarray(v, dtype=joints.dtype).reshape(2, 6) for v in (robot.joint_low, robot.joint_high))
-    return xp.concat([q[:, :4], xp.clip(ankles, low[:, 4:], high[:, 4:])], axis=-1).reshape(12)
+    to_w = rotations.to_matrix(trunk_orientation)
+    q, (ankles, _) = joints.reshape(2, 6), forward(robot, joints)
+    # the direction on the ground whose projection on the trunk's transverse plane is the hip's yaw
+    along, across = xp.cos(q[:, 0]), xp.sin(q[:, 0])
+    cosine, sine = to_w[1, 1] * along - to_w[1, 0] * across, to_w[0, 0] * across - to_w[0, 1] * along
+    length = xp.sqrt(cosine * cosine + sine * sine)
+    cosine, sine = cosine / length, sine / length
+
+    x, y, z = ((xp.asarray(robot.hips, dtype=joints.dtype) - ankles) @ to_w.T).T
+    x, y = cosine * x + sine * y, cosine * y - sine * x
+    height, knee = xp.sqrt(y * y + z * z), q[:, 3]
+    pitch = -xp.atan2(robot.thigh * xp.sin(knee), robot.shank + robot.thigh * xp.cos(knee)) - xp.atan2(x, height)
+    s_roll, c_roll = y / height, z / height
+    s_pitch, c_pitch = xp.sin(knee + pitch), xp.cos(knee + pitch)
+
+    def in_trunk(x: Array, y: Array, z: Array) -> Array:
+        """A vector of each thigh's frame, the hip's roll and pitch undone, in F_B: (3, 2)."""
+        x, z = c_pitch * x - s_pitch * z, s_pitch * x + c_pitch * z  # Ry(-(knee + pitch))
+        y, z = c_roll * y + s_roll * z, c_roll * z - s_roll * y  # Rx(-roll)
+        return (xp.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1) @ to_w).T
+
+    zero, one = xp.zeros_like(knee), xp.ones_like(knee)
+    ahead, left, up = in_trunk(one, zero, zero), in_trunk(zero, one, zero), in_trunk(zero, zero, one)
+    hips = xp.atan2(-left[0], left[1]), xp.asin(xp.clip(left[2], -1.0, 1.0)), xp.atan2(-ahead[2], up[2])
+    found = xp.stack([*hips, knee, pitch, xp.atan2(y, z)], axis=-1).reshape(12)
+    return xp.clip(found, *(xp.asarray(v, dtype=joints.dtype) for v in (robot.joint_low, robot.joint_high)))
 
 
 def measure(robot: Robot, qpos: Array) -> Nodes:
