@@ -29,7 +29,7 @@ class NetworkConfig:
     critic: tuple[int, ...] = (128, 128)
     activation: Literal["swish", "tanh", "relu"] = "swish"
     initial_noise: float = 0.7  # standard deviation of the Gaussian over the network's output
-    normalizer_floor: float = 0.05  # added to the variance of every observation, which may be constant at first
+    normalizer_floor: float = 0.0025  # added to the variance of every observation: a deviation of at least 0.05
     symmetric: bool = False  # shown the mirror image where the right foot leads: half as much to learn (`symmetry`)
     critic_sees_balance: bool = False  # also where the centre of mass is going, seen from the feet (`balance`)
 

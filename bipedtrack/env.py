@@ -74,7 +74,7 @@ class Answer(NamedTuple):
     """What one control step did besides moving the robot on."""
 
     joint_targets: Array  # (12,) rad
-    qacc: Array  # (18,) accelerations
+    qacc: Array  # (18,) accelerations as MuJoCo's solver has them, before the implicit integrator damps them
 
 
 def standing(

@@ -246,7 +246,7 @@ def _measure(the_robot: robot.Robot) -> Callable[[Array, Nodes], tuple[Nodes, Ar
 
 
 def _complete(the_robot: robot.Robot, samples: _Sample, measure: Callable[[Array, Nodes], tuple[Nodes, Array]]) -> Trace:
-    """The trace of samples (e, n, ...): with measured nodes, torques and time."""
+    """The trace of samples (e, n, ...): with measured nodes, torques (of undisturbed motors) and time."""
     measured, fell = jax.tree.map(np.asarray, measure(samples.qpos, samples.target))
     wanted = the_robot.kp * (samples.joint_targets - samples.qpos[..., 7:]) - the_robot.kd * samples.qvel[..., 6:]
     return Trace(

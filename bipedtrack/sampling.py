@@ -21,7 +21,7 @@ class Ranges(NamedTuple):
     """Table II as ranges: (lowest, mildest, highest) at full difficulty; at difficulty 0 all is mildest.
 
     An episode draws its motion from them; `step_variation` then goes up to a fifth beyond them from step to step, but for
-    the period, which stays inside.
+    the period: what would lie outside is the range's end, which at full difficulty is so for a fifth of the steps.
     """
 
     period: tuple[float, float, float] = (0.4, 0.55, 0.7)  # s, of a task step with a swing foot
@@ -37,7 +37,11 @@ class Ranges(NamedTuple):
     step_variation: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on period, lift and advance from step to step
     curve_along: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # shift of the Bezier control points, share of the way
     curve_height: tuple[float, float, float] = (0.8, 1.0, 1.2)  # factor on the heights of the Bezier control points
-    trigonometric: tuple[float, float, float] = (-1.0, -1.0, 0.3)  # below 0: Bezier ankles, above: trigonometric ones
+    trigonometric: tuple[float, float, float] = (
+        -1.0,
+        -1.0,
+        0.3,
+    )  # below 0: Bezier, above: trigonometric ankles, from 0.77 on
     swing_ease: tuple[float, float, float] = (0.2, 0.25, 0.3)  # planner.TaskStep.ease; 0: the paper's uniform curves
     sway: tuple[float, float, float] = (0.0, 0.0, 0.0)  # clipped to [0, 1]: factor on statics.pendulum; 0: the paper's trunk
     posture_x: tuple[float, float, float] = (-0.05, 0.0, 0.05)  # m, centre of mass before the feet's middle (stand, squat)
@@ -53,7 +57,7 @@ class Ranges(NamedTuple):
     wander_x: tuple[float, float, float] = (-0.10, 0.0, 0.25)  # m, of a foothold from beside the other foot, ahead
     wander_y: tuple[float, float, float] = (-0.02, 0.0, 0.15)  # m, outwards
     wander_yaw: tuple[float, float, float] = (-0.25, 0.0, 0.25)  # rad
-    push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk; in training alone
+    push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, horizontal impulse on the trunk, from 0; in training alone
     stair_push: tuple[float, float, float] = (0.0, 0.0, 30.0)  # N s, on stairs, where there is no room to step aside
 
     @property
@@ -70,6 +74,9 @@ class Ranges(NamedTuple):
         for name, (low, mild, high) in self._asdict().items():
             if not low <= mild <= high:
                 raise ValueError(f"{name} must be [lowest, mildest, highest], not {[low, mild, high]}")
+        for name in ("push", "stair_push"):
+            if getattr(self, name)[0] != 0:
+                raise ValueError(f"{name} must begin at 0, not {getattr(self, name)[0]:g}: impulses are drawn from 0 on")
         if min(self.period[0], self.squat_period[0]) < SHORTEST:
             raise ValueError(f"periods must be at least {SHORTEST:g} s")
         if not 0 <= self.swing_ease[0] <= self.swing_ease[2] < 0.5:

@@ -197,7 +197,10 @@ def _foothold(motion: Motion, rise: Array, closes: Array, swing: Array, advance:
 
 
 def _anywhere(key: Array, given: Distribution, outwards: Array) -> Array:
-    """The advance (3,) to a foothold within an ellipse of what can be reached; outwards: 1 for the left foot, else -1."""
+    """The advance (3,) to a foothold within an ellipse of what can be reached; outwards: 1 for the left foot, else -1.
+
+    What is drawn beyond the ellipse comes onto it, a fifth of all: the farthest footholds are the hardest.
+    """
     draw = sample(key, ("wander_x", "wander_y", "wander_yaw"), given.ranges)
 
     def share(name: str) -> Array:

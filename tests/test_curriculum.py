@@ -165,6 +165,7 @@ ADDED = [  # what is put in front, and the line it gives
     ("[ranges]\nsquat_period = [0, 1, 1.5]\n", "ranges: periods must be at least 0.1 s"),
     ("[ranges]\nwalk_stp = [0, 0, 0]\n", "ranges.walk_stp: unknown key; did you mean 'walk_step'?"),
     ("[ranges]\nwalk_step = [0, 0]\n", "ranges.walk_step: [0, 0] (list) has the length 2; wanted a list of 3"),
+    ("[ranges]\npush = [10, 10, 20]\n", "ranges: push must begin at 0, not 10: impulses are drawn from 0 on"),
     ("[ranges]\nlift = [0.1, 0.05, 0.2]\n", "ranges: lift must be [lowest, mildest, highest], not [0.1, 0.05, 0.2]"),
     (
         "[rewards.sharpness]\nankle_positon = 1\n",

@@ -358,7 +358,8 @@ def test_postures_fill_their_ranges(
     for name, found in drawn.items():
         lowest, _, highest = getattr(curriculum.ranges, name)
         margin = 0.05 * (highest - lowest)
-        rounding = 1e-3 if name in ("posture_x", "posture_y") else 1e-5  # they are met by a few iterations
+        # these two are met by a few iterations, with feet parallel to the trunk; level ones carry the legs elsewhere
+        rounding = 2e-3 if name in ("posture_x", "posture_y") else 1e-5
         assert lowest - rounding < found.min() < lowest + margin, name
         assert highest - margin < found.max() < highest + rounding, name
 
