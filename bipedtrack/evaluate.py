@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import signal
 import sys
 import time
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -362,8 +363,9 @@ def _without_curves(tree: Any) -> Any:
 
 
 def main() -> None:
-    """The command line. Exit status 0 when evaluated, 2 for bad input."""
+    """The command line. Exit status 0 when evaluated, 2 for bad input, 130 when interrupted."""
     options = tyro.cli(Evaluate, prog="python -m bipedtrack.evaluate")
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs would ignore Ctrl-C's signal
     try:
         versions.require()
         _check(options)

@@ -91,7 +91,7 @@ def test_a_foot_that_a_script_holds_up_comes_down_first(drive: Drive, robot: rob
         "lead": drive.lead,
         "place": lambda: drive.place(Foothold(1, 0.1, -0.1, 0.0)),
     }[wish]()
-    go(drive, 5.0)
+    go(drive, 3.0)
     assert drive.mode is Mode.STEER
     steps = footsteps.parse(drive.as_script(), robot, "drive").steps
     feet = [int(np.argmax(step.swing)) for step in steps if step.swing.any()]

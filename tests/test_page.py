@@ -199,10 +199,11 @@ def test_a_key_makes_it_walk_and_another_one_stops_it(tab: Tab, page: Page) -> N
     tab.press("i")
     wait_until(lambda: x_of(page) > 0.3)
     tab.press(" ")
-    wait_until(lambda: not page.clock.view.steering.moves)
-    time.sleep(2)
+    wait_until(lambda: not (page.clock.view.steering.moves or page.clock.view.prints))
+    stopped = page.clock.view.time  # of the simulation, which is slower than the clock on a busy machine
+    wait_until(lambda: page.clock.view.time > stopped + 1.5)
     at = x_of(page)
-    time.sleep(0.5)
+    wait_until(lambda: page.clock.view.time > stopped + 2.0)
     assert x_of(page) == pytest.approx(at, abs=0.02)
 
 
