@@ -116,6 +116,7 @@ def _outline(box: list[float], along: int | None) -> list[tuple[float, float]]:
 
 # Policies beside each other
 
+LEAST = f"Errors count only where at least {100 * LEAST_SHARE:g} % of the episodes last to the end."
 Estimate = tuple[float | None, float | None, float | None]  # mean and the ends of its interval
 Estimator = Callable[[dict[str, Any]], Estimate]  # of a summary
 

@@ -78,16 +78,14 @@ class Progress:
         record = {"stage": call.stage.name, "lesson": call.lesson.name, "call": call.index, "steps": step}
         record |= {"time": round(time.time(), 1), "steps_per_second": round(self._rate, 1), **figures}
         checkpoint.append_jsonl(self._folder / "progress.jsonl", record)
-        self._warn(self._events.add(step, figures))
+        problem = self._events.add(step, figures)
+        if problem:
+            self.say(f"warning: {problem}; goes on without")
         self._show(call, steps, figures, "training")
 
     def finished(self, call: Call) -> None:
         """Counts a finished call."""
         self._done += call.steps
-
-    def _warn(self, problem: str) -> None:
-        if problem:
-            self.say(f"warning: {problem}; goes on without")
 
     def _minutes_left(self, call: Call, step: int) -> float:
         """Of the steps that are left at the present speed, and of beginning the calls that are left as the last one did."""

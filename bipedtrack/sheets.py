@@ -9,7 +9,7 @@ from bipedtrack import charts, markup, metrics
 from bipedtrack.markup import escape, section, task_rows
 from bipedtrack.record import ENGINES, Run, engines_of, get, number, runs_of
 from bipedtrack.robot import LEGS
-from bipedtrack.verdicts import LEAST_SHARE, QUANTITIES
+from bipedtrack.verdicts import QUANTITIES
 
 
 class Column(NamedTuple):
@@ -155,8 +155,7 @@ def intervals(record: dict[str, Any]) -> str:
     panels += [charts.forest(record, f"Ankle {q.name} error, {q.unit}", charts.ankles(q), q.limit) for q in QUANTITIES]
     caption = (
         f"{charts.policy_key(record)} Mean and 95 % interval; errors are the mean of both ankles. The dashed line is the "
-        f"paper's bound; what lies beyond the axis stands at its end with its number. Errors count only where at least "
-        f"{100 * LEAST_SHARE:g} % of the episodes last to the end. {engine_words(runs)}"
+        f"paper's bound; what lies beyond the axis stands at its end with its number. {charts.LEAST} {engine_words(runs)}"
     )
     content = markup.figure("triple", panels, caption) + sheet(_INTERVALS, runs)
     return section("intervals", "Policies side by side", content)

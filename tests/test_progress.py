@@ -128,41 +128,43 @@ def test_without_a_terminal_lines_name_stage_steps_speed_and_time_left(
     assert "0.00 of 0.00 M" in second
 
 
+QUICK = curriculum.load("quick")
+QUICK_CALLS = curriculum.calls(QUICK)
+QUICK_STEPS = sum(call.steps for call in QUICK_CALLS)
+
+
+def minutes_left(line: str) -> float:
+    return float(re.search(r"(\d+) min left", line)[1])
+
+
 def test_time_left_is_the_rest_of_all_calls_at_the_present_speed(
     tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
     monkeypatch.setattr(progress, "_LINE_EVERY", -1.0)
-    plan = curriculum.load("quick")
-    calls = curriculum.calls(plan)
-    total = sum(call.steps for call in calls)
-    with Progress(tmp_path, plan, calls, 0) as shown:
-        shown.update(calls[0], 1000, FIGURES)
+    with Progress(tmp_path, QUICK, QUICK_CALLS, 0) as shown:
+        shown.update(QUICK_CALLS[0], 1000, FIGURES)
         clock.now += 0.3
-        shown.update(calls[0], 2000, FIGURES)
+        shown.update(QUICK_CALLS[0], 2000, FIGURES)
     second = capsys.readouterr().out.splitlines()[1]
-    minutes = (total - 2000) / (1000 / 0.3) / 60
-    assert float(re.search(r"(\d+) min left", second)[1]) == round(minutes)
-    assert f"of {total / 1e6:.2f} M" in second
+    assert minutes_left(second) == round((QUICK_STEPS - 2000) / (1000 / 0.3) / 60)
+    assert f"of {QUICK_STEPS / 1e6:.2f} M" in second
 
 
 def test_time_left_counts_what_the_calls_that_are_left_need_to_begin(
     tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
     monkeypatch.setattr(progress, "_LINE_EVERY", -1.0)
-    plan = curriculum.load("quick")
-    calls = curriculum.calls(plan)
-    total = sum(call.steps for call in calls)
-    with Progress(tmp_path, plan, calls, 0) as shown:
-        shown.compiling(calls[0], "the environment")
-        clock.now += 10.0
-        shown.compiling(calls[0], "the learner")
-        clock.now += 30.0
-        shown.update(calls[0], 1000, FIGURES)
+    first = QUICK_CALLS[0]
+    with Progress(tmp_path, QUICK, QUICK_CALLS, 0) as shown:
+        for what, seconds in (("the environment", 10.0), ("the learner", 30.0)):
+            shown.compiling(first, what)
+            clock.now += seconds
+        shown.update(first, 1000, FIGURES)
         clock.now += 0.5
-        shown.update(calls[0], 2000, FIGURES)
+        shown.update(first, 2000, FIGURES)
     # 2000 steps/s; of 40 s the first 1000 steps took half a second
-    minutes = ((total - 2000) / 2000 + (len(calls) - 1) * 39.5) / 60
-    assert float(re.search(r"(\d+) min left", capsys.readouterr().out.splitlines()[-1])[1]) == round(minutes)
+    minutes = ((QUICK_STEPS - 2000) / 2000 + (len(QUICK_CALLS) - 1) * 39.5) / 60
+    assert minutes_left(capsys.readouterr().out.splitlines()[-1]) == round(minutes)
 
 
 def test_a_training_goes_on_where_tensorboard_has_no_place(
